@@ -1,0 +1,18 @@
+"""jaxbox: training-free LiDAR vehicle detection as one compiled JAX function."""
+
+from jaxbox.config import DetectorConfig
+from jaxbox.types import Calibration, Detections, GroundPlane, Hulls, Label, PointCloud, Status, stack_clouds
+from jaxbox.version import __version__
+
+__all__ = [
+    "Calibration",
+    "Detections",
+    "DetectorConfig",
+    "GroundPlane",
+    "Hulls",
+    "Label",
+    "PointCloud",
+    "Status",
+    "__version__",
+    "stack_clouds",
+]

@@ -1,0 +1,394 @@
+"""The detector's settings: one sub-config a stage, and the presets.
+
+A field marked static decides a shape or a loop bound: changing it compiles anew. Every other field
+is compared with data and is traced: a sweep over thresholds is a `jax.vmap` and compiles once.
+Lengths are metres, angles degrees (``_deg``), everything else unitless unless said.
+"""
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any, Literal, TypeVar, dataclass_transform
+
+import jax
+import numpy as np
+
+_T = TypeVar("_T")
+
+Scalar = float | jax.Array
+"""A traced threshold: a Python float, or an array scalar under `jax.vmap`."""
+
+
+def _static(default: Any) -> Any:
+    return dataclasses.field(default=default, metadata={"static": True})
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(_static,))
+def _config(cls: type[_T]) -> type[_T]:
+    return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True, kw_only=True)(cls))
+
+
+@_config
+class RegionConfig:
+    """The part of the world that is looked at; points outside are counted and left out."""
+
+    half_x_m: float = _static(80.0)
+    """static: |x| below this."""
+    half_y_m: float = _static(60.0)
+    """static: |y| below this."""
+
+
+@_config
+class FilterConfig:
+    """Statistical filtering by mean shift and standard deviation (paper, 3.1)."""
+
+    enabled: bool = _static(True)
+    """static: whether the stage runs."""
+    cell_m: float = _static(1.0)
+    """static: edge of the grid's cells, over the region."""
+    num_levels: int = _static(8)
+    """static: cells of the grid in height, centred on the sensor; points beyond join the end levels."""
+    num_iterations: int = _static(3)
+    """static: mean shift iterations."""
+    bandwidth_m: Scalar = 1.0
+    """Standard deviation of the Gaussian window that weighs the neighbouring cells."""
+    num_std: Scalar = 4.0
+    """t: a point farther from its converged centroid than mean + t standard deviations is an outlier."""
+    min_density: Scalar = 1.1
+    """Points whose window holds a smaller weight are outliers: a point alone in it weighs 1."""
+
+
+@_config
+class GroundConfig:
+    """RANSAC ground removal (Algorithm I), and the ground grid that follows uneven roads."""
+
+    candidates: Literal["cell_minima", "points"] = _static("cell_minima")
+    """static: what planes are fitted to: the lowest point of each 1 m cell, or points spread evenly
+    over the sweep (the paper)."""
+    num_candidates: int = _static(4096)
+    """static: how many points for ``candidates="points"``."""
+    candidate_half_x_m: float = _static(40.0)
+    """static: cell minima are taken where |x| is below this."""
+    candidate_half_y_m: float = _static(20.0)
+    """static: cell minima are taken where |y| is below this."""
+    num_hypotheses: int = _static(128)
+    """static: R, planes sampled in a round."""
+    max_planes: int = _static(1)
+    """static: rounds; each removes the inliers of its plane (Algorithm I, "repeat")."""
+    num_refits: int = _static(3)
+    """static: refits of the best plane on all its inliers."""
+    tolerance_m: Scalar = 0.2
+    """A candidate within this of a plane is an inlier."""
+    max_slope_deg: Scalar = 12.0
+    """Steeper planes are no ground."""
+    min_inlier_fraction: Scalar = 0.1
+    """A plane with a smaller share of the candidates is no ground."""
+    surface: bool = _static(True)
+    """static: refine the plane by the ground grid; False stops at the planes (the paper)."""
+    surface_cell_m: float = _static(0.5)
+    """static: edge of the ground grid's cells."""
+    surface_half_m: float = _static(80.0)
+    """static: the ground grid covers |x|, |y| below this; beyond it its border value holds."""
+    num_envelope_rounds: int = _static(10)
+    """static: cells over which the slope limit spreads."""
+    max_grade: Scalar = 0.2
+    """Steepest rise of the ground relative to the plane, m/m."""
+    band_below_m: Scalar = 0.3
+    """Points lower than the plane by more than this, at the sensor, are no ground."""
+    band_below_grade: Scalar = 0.02
+    """Growth of that band with range, m/m."""
+    band_above_m: Scalar = 0.3
+    """Points higher than the plane by more than this, at the sensor, are no ground."""
+    band_above_grade: Scalar = 0.06
+    """Growth of that band with range, m/m."""
+    blind_radius_m: Scalar = 2.5
+    """Points nearer than this are the carrier vehicle, not ground."""
+    envelope_margin_m: Scalar = 0.1
+    """A cell minimum within this of the lower envelope is ground."""
+    smoothing_m: Scalar = 1.0
+    """Standard deviation of the Gaussian that smooths the ground grid (and fills it, 4 x wider)."""
+    min_height_m: Scalar = 0.2
+    """A point higher above the ground than this is an obstacle; others are ground."""
+    max_height_m: Scalar = 4.0
+    """A point higher above the ground than this is overhead, and left out."""
+
+
+@_config
+class ComponentMap:
+    """One occupancy grid whose connected components propose clusters."""
+
+    cell_m: float = _static(0.2)
+    """static: edge of the cells; neighbours (also diagonal ones) are linked."""
+    num_levels: int = _static(1)
+    """static: cells in height; 1 is a bird's-eye view map, more is a 3D grid."""
+    max_cells: int = _static(16384)
+    """static: capacity for occupied cells."""
+    max_clusters: int = _static(512)
+    """static: capacity for clusters that pass the gates."""
+    min_height_m: Scalar = 0.2
+    """Only points higher above the ground than this."""
+    max_height_m: Scalar = 2.6
+    """Only points lower above the ground than this."""
+
+
+@_config
+class ClusteringConfig:
+    """Euclidean clustering on grids (paper, 3.2, Algorithm II).
+
+    Each map of the default preset is only a proposal: a finer map splits what a coarser one merges,
+    and the evidence for the boxes decides.
+    """
+
+    maps: tuple[ComponentMap, ...] = (
+        ComponentMap(cell_m=0.2, max_cells=16384),
+        ComponentMap(cell_m=0.35, max_cells=8192),
+        ComponentMap(cell_m=0.1, max_cells=24576, min_height_m=0.3, max_height_m=2.0),
+        ComponentMap(cell_m=0.5, max_cells=8192),
+    )
+    """The component maps; the first also gives the scene direction and the components for display."""
+    max_obstacles: int | None = _static(None)
+    """static: capacity for points above the ground; None is 3/4 of the cloud's capacity."""
+    adaptive_start_m: Scalar = 20.0
+    """Range from which the linking distance grows."""
+    adaptive_growth: Scalar = 0.01
+    """Growth of the linking distance with range beyond the start, per metre; 0 keeps it fixed."""
+    min_points: Scalar = 8.0
+    """Clusters with fewer points are left out."""
+    max_extent_m: Scalar = 12.0
+    """Clusters longer than this along x or y are left out."""
+
+
+@_config
+class EvidenceConfig:
+    """What each beam says about a box: hit, seen through (free) or hidden, on a polar grid."""
+
+    enabled: bool = _static(True)
+    """static: whether the evidence is built; without it every box counts as hit."""
+    num_azimuths: int = _static(1440)
+    """static: azimuth cells of the polar grid, all round."""
+    num_ranges: int = _static(320)
+    """static: range cells of the polar grid."""
+    range_cell_m: float = _static(0.25)
+    """static: length of a range cell."""
+    min_range_m: Scalar = 2.0
+    """Nearer returns are the carrier vehicle."""
+    hit_min_height_m: Scalar = 0.3
+    """A return between these heights is a hit."""
+    hit_max_height_m: Scalar = 1.2
+    """See ``hit_min_height_m``."""
+    free_min_height_m: Scalar = 0.35
+    """A beam between these heights shows that the space is free."""
+    free_max_height_m: Scalar = 0.8
+    """See ``free_min_height_m``."""
+    end_gap_m: Scalar = 0.3
+    """A beam that ends between those heights shows free space up to this before its return."""
+    support_height_m: Scalar = 0.15
+    """Points within this of the ground support the ground round a box."""
+
+
+@_config
+class HullConfig:
+    """Convex hull (paper, 3.3)."""
+
+    max_vertices: int = _static(32)
+    """static: H, capacity for hull vertices."""
+    num_slices: int = _static(32)
+    """static: slices along each axis whose extreme points reach the hull; the hull misses points by
+    at most one slice (the cluster's extent over the number of slices)."""
+
+
+@_config
+class BoxConfig:
+    """Rectangle by trying all rotations (paper, 3.4, Algorithm III)."""
+
+    criterion: Literal["area", "variance", "closeness", "visible_closeness"] = _static("visible_closeness")
+    """static: what the best rotation has: the smallest area (the paper), the smallest variance of the
+    distances to the edges, the points closest to the edges, or to the two edges facing the sensor."""
+    num_angles: int = _static(90)
+    """static: A, rotations tried over 90 degrees."""
+    max_points: int = _static(128)
+    """static: M, points of a cluster that the rectangle is fitted to, spread evenly over it."""
+    max_slab_points: int | None = _static(None)
+    """static: capacity for points between the slab's heights; None is 1/4 of the cloud's capacity."""
+    slab_min_height_m: Scalar = 0.2
+    """Only points higher than this shape the rectangle: below are wheels and kerb."""
+    slab_max_height_m: Scalar = 0.8
+    """Only points lower than this shape the rectangle: above are mirrors and the narrower cabin."""
+    min_slab_points: Scalar = 5.0
+    """Clusters with fewer points between those heights are fitted to all their points."""
+    min_distance_m: Scalar = 0.05
+    """Closeness: points nearer to an edge than this count as on it."""
+    scene_direction: bool = _static(True)
+    """static: prefer the direction that most boxes of the sweep share."""
+    direction_weight: Scalar = 0.2
+    """Height of that preference, in closeness."""
+    direction_sigma_deg: Scalar = 3.0
+    """Width of the vote and of the preference: exp(-(d / sigma)^2)."""
+    direction_min_extent_m: Scalar = 2.2
+    """Boxes with a shorter longest extent do not vote."""
+    direction_max_free: Scalar = 0.15
+    """Boxes with a larger free fraction do not vote."""
+
+
+@_config
+class CompletionConfig:
+    """Correction for occluded vehicles: sides out of sight are completed by the class prior."""
+
+    mode: Literal["none", "away", "evidence"] = _static("evidence")
+    """static: keep the rectangle as measured (the paper); extend its hidden sides away from the
+    sensor; or let the evidence choose among hypotheses."""
+    num_rays: int = _static(32)
+    """static: rays over the box when hypotheses are compared."""
+    num_final_rays: int = _static(48)
+    """static: rays over the box for its score."""
+    free_weight: Scalar = 1.0
+    """Cost of the fraction of rays that pass through."""
+    free_length_weight: Scalar = 2.0
+    """Cost of the fraction of the box's area seen to be free."""
+    inside_weight: Scalar = 1.0
+    """Worth of the fraction of fitted points inside the box."""
+    near_weight: Scalar = 0.5
+    """Worth of the mean closeness of fitted points to the visible faces."""
+    closeness_weight: Scalar = 1.0
+    """Worth of the rectangle criterion."""
+    not_away_cost: Scalar = 0.02
+    """Cost of a width that does not extend away from the sensor."""
+
+
+@_config
+class ClassPrior:
+    """One vehicle class: size prior and gates."""
+
+    length_m: Scalar
+    """Hidden lengths are completed to this, and scored against it."""
+    width_m: Scalar
+    """Hidden widths are completed to this, and scored against it."""
+    height_m: Scalar
+    """Heights are scored against this."""
+    length_below_m: Scalar
+    """Width of the length score below the prior, exp(-(d / w)^2)."""
+    length_above_m: Scalar
+    """Width of the length score above the prior."""
+    width_tolerance_m: Scalar
+    """Width of the width score."""
+    height_tolerance_m: Scalar
+    """Width of the height score."""
+    min_height_m: Scalar
+    """Lower tops, after the range allowance, are no such vehicle."""
+    max_height_m: Scalar
+    """Higher tops are no such vehicle."""
+    max_length_m: Scalar
+    """Longer measured extents are no such vehicle."""
+    max_width_m: Scalar
+    """Wider measured extents are no such vehicle."""
+    min_box_height_m: Scalar
+    """Boxes are at least so high: their tops read low."""
+    count_max_height_m: Scalar
+    """Points lower than this above the ground belong to the vehicle; higher ones within the box
+    speak against it."""
+
+
+# Sizes are medians over the 7,481 KITTI object label files; gates and widths were chosen on KITTI.
+CAR = ClassPrior(
+    length_m=3.9, width_m=1.63, height_m=1.5,
+    length_below_m=0.8, length_above_m=2.0, width_tolerance_m=0.3, height_tolerance_m=0.3,
+    min_height_m=1.0, max_height_m=2.3, max_length_m=6.5, max_width_m=2.4, min_box_height_m=1.48,
+    count_max_height_m=2.0,
+)  # fmt: skip
+VAN = ClassPrior(
+    length_m=4.98, width_m=1.88, height_m=2.13,
+    length_below_m=0.8, length_above_m=1.5, width_tolerance_m=0.3, height_tolerance_m=0.35,
+    min_height_m=1.7, max_height_m=2.7, max_length_m=7.5, max_width_m=2.6, min_box_height_m=1.8,
+    count_max_height_m=2.7,
+)  # fmt: skip
+TRUCK = ClassPrior(
+    length_m=10.81, width_m=2.63, height_m=3.34,
+    length_below_m=5.0, length_above_m=4.0, width_tolerance_m=0.4, height_tolerance_m=0.8,
+    min_height_m=2.4, max_height_m=4.0, max_length_m=18.0, max_width_m=3.2, min_box_height_m=2.6,
+    count_max_height_m=4.0,
+)  # fmt: skip
+
+
+@_config
+class VehicleConfig:
+    """Vehicle decision: gates, score and suppression."""
+
+    classes: tuple[ClassPrior, ClassPrior, ClassPrior] = (CAR, VAN, TRUCK)
+    """Priors of car, van and truck."""
+    large_height_m: Scalar = 1.7
+    """Clusters higher than this are also tried as a van or a truck."""
+    max_large: int = _static(256)
+    """static: capacity for clusters also tried as a van or a truck."""
+    max_candidates: int = _static(512)
+    """static: capacity for boxes that pass the gates, before suppression."""
+    max_detections: int = _static(128)
+    """static: K, capacity for boxes in the answer."""
+    max_nearby: int = _static(2048)
+    """static: points looked at round a box; where there are more, every so many are and count so
+    many times."""
+    margin_m: Scalar = 0.1
+    """A point this far outside a box still counts as inside."""
+    ring_m: Scalar = 0.5
+    """A point farther outside than the margin but nearer than this speaks against the box."""
+    top_margin_m: Scalar = 0.04
+    """Added to the highest return: beams seldom meet the very top."""
+    top_grade: Scalar = 0.0075
+    """A top may be higher than its highest return by this times the range: the beams' spacing."""
+    min_extent_m: Scalar = 1.0
+    """Boxes with both measured extents shorter than this are no vehicle."""
+    saturation_points: Scalar = 100.0
+    """Clusters with at least so many points lose no score for sparseness."""
+    sparseness_power: Scalar = 0.3
+    """score x min(1, points / saturation)^power."""
+    free_scale: Scalar = 0.15
+    """score x exp(-(free fraction / scale)^2)."""
+    ring_weight: Scalar = 8.0
+    """score x exp(-weight x ring points / points)."""
+    overhead_weight: Scalar = 8.0
+    """score x exp(-weight x points above / points)."""
+    support_points: Scalar = 10.0
+    """score x min(1, ground points round the box / this)."""
+    objective_gate: Scalar = 2.4
+    """score / (1 + exp(-(J - gate) / softness)), J the objective of the completion."""
+    objective_softness: Scalar = 0.1
+    """See ``objective_gate``."""
+    min_score: Scalar = 1e-4
+    """Boxes that score less are left out. Cut where you act: about 0.2 for precision."""
+    max_overlap: Scalar = 0.1
+    """Of two boxes with a larger bird's-eye view IoU, the lower-scoring is suppressed."""
+
+
+@_config
+class DetectorConfig:
+    """All settings of `jaxbox.detect`.
+
+    >>> DetectorConfig.paper().box.criterion
+    'area'
+    """
+
+    region: RegionConfig = RegionConfig()
+    filtering: FilterConfig = FilterConfig()
+    ground: GroundConfig = GroundConfig()
+    clustering: ClusteringConfig = ClusteringConfig()
+    evidence: EvidenceConfig = EvidenceConfig()
+    hull: HullConfig = HullConfig()
+    box: BoxConfig = BoxConfig()
+    completion: CompletionConfig = CompletionConfig()
+    vehicles: VehicleConfig = VehicleConfig()
+
+    @classmethod
+    def paper(cls) -> "DetectorConfig":
+        """The paper's own choices: one plane, fixed tolerance, smallest area, no completion."""
+        return cls(
+            ground=GroundConfig(candidates="points", surface=False, min_height_m=0.2),
+            clustering=ClusteringConfig(
+                maps=(ComponentMap(cell_m=0.35, num_levels=8, max_cells=24576),), adaptive_growth=0.0
+            ),
+            evidence=EvidenceConfig(enabled=False),
+            box=BoxConfig(criterion="area", scene_direction=False, slab_min_height_m=0.0, slab_max_height_m=4.0),
+            completion=CompletionConfig(mode="none"),
+        )
+
+    @classmethod
+    def presets(cls) -> dict[str, "DetectorConfig"]:
+        """The named presets that the command line offers."""
+        return {"default": cls(), "paper": cls.paper()}

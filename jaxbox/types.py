@@ -1,0 +1,384 @@
+"""The data that flows between the stages: frozen pytree dataclasses, and the status bits.
+
+Axis letters, project-wide: N points, K detections or clusters, H hull vertices, B batch.
+
+Conventions, project-wide:
+
+- The sensor frame ("velo") is x forward, y left, z up, in metres, with the sensor at the origin.
+- ``size`` is (length, width, height) with length >= width.
+- ``yaw`` turns +x to the length axis about +z, radians, in [-pi/2, pi/2): a box has no front.
+- Invalid rows are masked by ``valid`` and hold finite numbers; dropped things are counted.
+"""
+
+import dataclasses
+import enum
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+CAPACITY_BUCKETS = tuple(2**k for k in range(14, 21))
+"""Point capacities that `PointCloud.from_numpy` pads to: 16,384 to 1,048,576. One compile a bucket."""
+
+
+class Status(enum.IntFlag):
+    """What happened to a sweep. Zero is a clean run; each bit is explained by `describe`."""
+
+    OK = 0
+    EMPTY = 1
+    NONFINITE_POINTS = 2
+    POINT_OVERFLOW = 4
+    NO_GROUND = 8
+    OBSTACLE_OVERFLOW = 16
+    CELL_OVERFLOW = 32
+    CLUSTER_OVERFLOW = 64
+    CANDIDATE_OVERFLOW = 128
+    DETECTION_OVERFLOW = 256
+    HULL_OVERFLOW = 512
+
+    def describe(self) -> list[str]:
+        """Returns one sentence a set bit: what happened and what to do about it.
+
+        >>> Status.NO_GROUND.describe()
+        ['NO_GROUND: no plane had enough support; heights are taken from the lowest point instead.']
+        """
+        return [f"{bit.name}: {_STATUS_TEXT[bit]}" for bit in _STATUS_TEXT if bit in self]
+
+
+_STATUS_TEXT = {
+    Status.EMPTY: "no finite point lies within the region; there is nothing to detect.",
+    Status.NONFINITE_POINTS: "points with NaN or infinite coordinates were ignored.",
+    Status.POINT_OVERFLOW: "the sweep has more points than the cloud's capacity; the farthest "
+    "were dropped. Use PointCloud.from_numpy(..., capacity=...) with a larger capacity.",
+    Status.NO_GROUND: "no plane had enough support; heights are taken from the lowest point instead.",
+    Status.OBSTACLE_OVERFLOW: "more points above the ground than clustering.max_obstacles (or, for "
+    "the points a box is fitted to, box.max_slab_points); the last in the sweep's order were dropped.",
+    Status.CELL_OVERFLOW: "a component map has more occupied cells than its max_cells; "
+    "points in the cells beyond it belong to no cluster.",
+    Status.CLUSTER_OVERFLOW: "a component map has more clusters than its max_clusters; "
+    "the ones beyond it were not examined.",
+    Status.CANDIDATE_OVERFLOW: "more boxes passed the gates than vehicles.max_candidates; "
+    "the lowest-scoring were dropped.",
+    Status.DETECTION_OVERFLOW: "more detections than vehicles.max_detections; "
+    "the lowest-scoring were dropped.",
+    Status.HULL_OVERFLOW: "a hull has more vertices than hull.max_vertices; "
+    "every so many were kept, evenly round the hull.",
+}
+
+
+class Label(enum.IntEnum):
+    """The vehicle classes, as stored in `Detections.label`."""
+
+    CAR = 0
+    VAN = 1
+    TRUCK = 2
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class PointCloud:
+    """One sweep, padded to a capacity N. Build it with `from_numpy`."""
+
+    xyz1: jax.Array
+    """(N, 4) float32, m, sensor frame: x, y, z and 1 for a point, all 0 for padding."""
+    intensity: jax.Array
+    """(N,) float32, the sensor's own unit; 0 where unknown and for padding."""
+    num_points: jax.Array
+    """() int32: points in the source sweep, which may exceed N (see `Status.POINT_OVERFLOW`)."""
+
+    @property
+    def capacity(self) -> int:
+        """N, the padded number of points."""
+        return self.xyz1.shape[-2]
+
+    @classmethod
+    def from_numpy(
+        cls, xyz: np.ndarray, intensity: np.ndarray | None = None, *, capacity: int | None = None
+    ) -> "PointCloud":
+        """Pads one sweep to a capacity, so that sweeps of different length share one compile.
+
+        Args:
+          xyz: (n, 3) real numbers, m, sensor frame. NaN and infinity are allowed and are ignored,
+            and counted, by the detector.
+          intensity: (n,) real numbers, or None for zeros.
+          capacity: N; by default the smallest of `CAPACITY_BUCKETS` that holds n points, or the
+            largest bucket. Where n is larger than N the N nearest points are kept, in their order.
+
+        Returns:
+          A cloud whose `num_points` is n, also where points were dropped.
+
+        Raises:
+          ValueError: for another shape, a non-numeric type or a capacity below 1.
+
+        >>> PointCloud.from_numpy(np.zeros((5, 3), np.float32)).capacity
+        16384
+        """
+        xyz, intensity = _checked_points(xyz, intensity)
+        if capacity is None:
+            capacity = next((b for b in CAPACITY_BUCKETS if b >= len(xyz)), CAPACITY_BUCKETS[-1])
+        if capacity < 1:
+            raise ValueError(f"capacity is {capacity}; it must be at least 1.")
+        num_points = len(xyz)
+        if num_points > capacity:
+            keep = _nearest(xyz, capacity)
+            xyz, intensity = xyz[keep], intensity[keep]
+        rows = np.zeros((capacity, 4), np.float32)
+        rows[: len(xyz), :3] = xyz
+        rows[: len(xyz), 3] = 1
+        padded = np.zeros(capacity, np.float32)
+        padded[: len(xyz)] = intensity
+        return cls(jnp.asarray(rows), jnp.asarray(padded), jnp.int32(num_points))
+
+
+def _checked_points(xyz: np.ndarray, intensity: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    xyz = np.asarray(xyz)
+    if xyz.ndim != 2 or xyz.shape[1] != 3:
+        raise ValueError(
+            f"xyz has shape {xyz.shape}; it must be (n, 3). Pass points[:, :3] of a wider array."
+        )
+    if intensity is None:
+        intensity = np.zeros(len(xyz), np.float32)
+    intensity = np.asarray(intensity)
+    if intensity.shape != (len(xyz),):
+        raise ValueError(f"intensity has shape {intensity.shape}; it must be ({len(xyz)},), one a point.")
+    for name, array in (("xyz", xyz), ("intensity", intensity)):
+        if array.dtype.kind not in "fiu":
+            raise ValueError(f"{name} has dtype {array.dtype}; it must be real numbers.")
+    # A float64 beyond float32's range becomes infinite here, and is counted as non-finite later.
+    with np.errstate(over="ignore"):
+        return xyz.astype(np.float32), intensity.astype(np.float32)
+
+
+def _nearest(xyz: np.ndarray, count: int) -> np.ndarray:
+    """Indices, ascending, of the `count` points nearest to the sensor; non-finite ones go first."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        distance = np.linalg.norm(xyz.astype(np.float64), axis=1)
+    distance = np.where(np.isfinite(distance), distance, np.inf)
+    return np.sort(np.argsort(distance, kind="stable")[:count])
+
+
+def stack_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
+    """Stacks sweeps of one capacity into a batch for `jax.vmap(jaxbox.detect)`.
+
+    Args:
+      clouds: at least one cloud, all of the same capacity.
+
+    Returns:
+      A cloud whose arrays have a leading axis B.
+
+    Raises:
+      ValueError: for no clouds, or for different capacities.
+    """
+    capacities = {cloud.capacity for cloud in clouds}
+    if len(capacities) != 1:
+        raise ValueError(
+            f"the clouds have capacities {sorted(capacities)}; a batch needs one. "
+            "Pass the same capacity=... to PointCloud.from_numpy for each."
+        )
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *clouds)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class GroundPlane:
+    """The plane z = a x + b y + c that carries the most support."""
+
+    coefficients: jax.Array
+    """(3,) float32: a, b (slopes, unitless) and c (m, minus the sensor's height)."""
+    found: jax.Array
+    """() bool: False where no plane had enough support; then a = b = 0 and c is the lowest z."""
+    num_inliers: jax.Array
+    """() int32: candidates within the tolerance of the plane."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Clusters:
+    """The clusters of one component map that pass the size gates."""
+
+    slot: jax.Array
+    """(N,) int32: row of each point's cluster, or K where it has none."""
+    num_points: jax.Array
+    """(K,) int32: points of each cluster; 0 for an empty row."""
+    num_clusters: jax.Array
+    """() int32: clusters that pass the gates, which may exceed K."""
+    num_cells: jax.Array
+    """() int32: occupied cells of the map, which may exceed its capacity."""
+    component: jax.Array
+    """(N,) int32: connected component of each point, before any gate; -1 where it has none."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Hulls:
+    """Convex hulls in the bird's-eye view, padded by repeating the last vertex."""
+
+    vertices: jax.Array
+    """(K, H, 2) float32, m, sensor frame: counter-clockwise."""
+    num_vertices: jax.Array
+    """(K,) int32: true number of vertices, which may exceed H; 0 for an empty row."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Descriptors:
+    """Shape descriptors of each detection's points (paper, 3.5 and 4.4)."""
+
+    moment_of_inertia: jax.Array
+    """(K, 2) float32, m^2: second central moments per point about the minor and the major axis,
+    in the bird's-eye view (eigenvalues of the covariance, larger first)."""
+    eccentricity: jax.Array
+    """(K,) float32, >= 1: length of the major axis over length of the minor axis."""
+    density: jax.Array
+    """(K,) float32, points per m^2 of hull area."""
+    complexity: jax.Array
+    """(K,) float32: kappa = hull vertices / points (paper, equation 7)."""
+
+
+NUM_POINT_COUNTS = 9
+"""The first so many fields of `Counts` share out every point of the sweep."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Counts:
+    """True counts of the whole sweep: where each point went, and what each capacity had to hold.
+
+    Every point of the source sweep is in exactly one of the first nine, so they sum to
+    `PointCloud.num_points`.
+    """
+
+    dropped_points: jax.Array
+    """() int32: points beyond the cloud's capacity."""
+    nonfinite_points: jax.Array
+    """() int32: NaN or infinite points."""
+    out_of_range_points: jax.Array
+    """() int32: points outside the region."""
+    outlier_points: jax.Array
+    """() int32: points that the statistical filter removed."""
+    ground_points: jax.Array
+    """() int32: points on or below the ground."""
+    overhead_points: jax.Array
+    """() int32: points higher above the ground than any vehicle."""
+    dropped_obstacles: jax.Array
+    """() int32: points above the ground beyond the obstacle capacity."""
+    clustered_points: jax.Array
+    """() int32: points of a cluster that passed the size gates in at least one map."""
+    unclustered_points: jax.Array
+    """() int32: obstacle points of no such cluster (too few, too long, or beyond a capacity)."""
+    obstacles: jax.Array
+    """() int32: points above the ground, which clustering.max_obstacles must hold."""
+    slab_points: jax.Array
+    """() int32: points between the heights a box is fitted to, which box.max_slab_points must hold."""
+    cells: jax.Array
+    """(maps,) int32: occupied cells of each component map."""
+    clusters: jax.Array
+    """(maps,) int32: clusters of each map that pass the size gates."""
+    candidates: jax.Array
+    """() int32: boxes that pass the gates, before suppression."""
+    detections: jax.Array
+    """() int32: boxes after suppression."""
+    hull_vertices: jax.Array
+    """() int32: vertices of the largest hull."""
+
+    @property
+    def num_points(self) -> int:
+        """Points of the source sweep: the sum of the nine places a point can be in."""
+        fields = dataclasses.fields(self)[:NUM_POINT_COUNTS]
+        return sum(int(getattr(self, field.name)) for field in fields)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Detections:
+    """Vehicle boxes of one sweep, best score first, and the evidence for them."""
+
+    center: jax.Array
+    """(K, 3) float32, m, sensor frame: centre of the box."""
+    size: jax.Array
+    """(K, 3) float32, m: length >= width, height."""
+    yaw: jax.Array
+    """(K,) float32, rad, in [-pi/2, pi/2): length axis from +x about +z."""
+    score: jax.Array
+    """(K,) float32, in [0, 1]."""
+    label: jax.Array
+    """(K,) int32: a `Label`."""
+    valid: jax.Array
+    """(K,) bool: True for a box, False for padding."""
+    num_points: jax.Array
+    """(K,) int32: points of the box's cluster inside the box."""
+    hulls: Hulls
+    """Hull of those points."""
+    descriptors: Descriptors
+    """Descriptors of those points."""
+    ground: GroundPlane
+    """The ground plane."""
+    ground_mask: jax.Array
+    """(N,) bool: points on or below the ground."""
+    point_component: jax.Array
+    """(N,) int32: connected component of each point in the first map, -1 where it has none."""
+    point_detection: jax.Array
+    """(N,) int32: row of the box that the point belongs to, -1 where there is none."""
+    status: jax.Array
+    """() int32: `Status` bits."""
+    counts: Counts
+    """Where every point went."""
+
+    def raise_if_failed(self) -> None:
+        """Raises where anything was dropped for want of capacity, naming the field to enlarge.
+
+        Raises:
+          RuntimeError: one line a failure, with the configuration field and the size needed.
+        """
+        status = Status(int(self.status))
+        failures = [_overflow_text(bit, self.counts) for bit in _OVERFLOW_BITS if bit in status]
+        if failures:
+            raise RuntimeError("\n".join(failures))
+
+
+_OVERFLOW_BITS = (
+    Status.POINT_OVERFLOW,
+    Status.OBSTACLE_OVERFLOW,
+    Status.CELL_OVERFLOW,
+    Status.CLUSTER_OVERFLOW,
+    Status.CANDIDATE_OVERFLOW,
+    Status.DETECTION_OVERFLOW,
+    Status.HULL_OVERFLOW,
+)
+
+
+def _overflow_text(bit: Status, counts: Counts) -> str:
+    per_map = {
+        Status.CELL_OVERFLOW: ("max_cells", counts.cells),
+        Status.CLUSTER_OVERFLOW: ("max_clusters", counts.clusters),
+    }
+    if bit in per_map:
+        field, needed = per_map[bit]
+        sizes = ", ".join(str(int(n)) for n in np.asarray(needed))
+        return f"{bit.name}: clustering.maps[i].{field} must be at least {sizes} (one number a map)."
+    if bit is Status.OBSTACLE_OVERFLOW:
+        return (
+            f"{bit.name}: clustering.max_obstacles must be at least {int(counts.obstacles)} "
+            f"and box.max_slab_points at least {int(counts.slab_points)}."
+        )
+    field, needed = {
+        Status.POINT_OVERFLOW: ("PointCloud.from_numpy(capacity=...)", counts.num_points),
+        Status.CANDIDATE_OVERFLOW: ("vehicles.max_candidates", counts.candidates),
+        Status.DETECTION_OVERFLOW: ("vehicles.max_detections", counts.detections),
+        Status.HULL_OVERFLOW: ("hull.max_vertices", counts.hull_vertices),
+    }[bit]
+    return f"{bit.name}: {field} must be at least {int(needed)}."
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Calibration:
+    """A camera and where it stands relative to the LiDAR (paper, 3.6, equations 1-5)."""
+
+    P_rect: jax.Array
+    """(3, 4) float32: projection P = K [R | t] from the rectified camera frame to pixels."""
+    T_rect_velo: jax.Array
+    """(4, 4) float32: rigid transform from the LiDAR frame to the rectified camera frame."""
+    image_size_px: jax.Array
+    """(2,) int32: width and height of the image."""

@@ -1,0 +1,16 @@
+"""Shared fixtures: the real sweeps, and compiled functions that the tests share."""
+
+import os
+import pathlib
+
+import pytest
+
+DATA = pathlib.Path(os.environ.get("JAXBOX_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
+
+
+@pytest.fixture(scope="session")
+def data_root() -> pathlib.Path:
+    """The folder of real sweeps; tests that need it skip, saying so, where it is absent."""
+    if not DATA.is_dir():
+        pytest.skip(f"no real sweeps: {DATA} is not a folder; set JAXBOX_DATA")
+    return DATA
