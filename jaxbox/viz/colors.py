@@ -1,0 +1,69 @@
+"""Colours of points and boxes, red green blue."""
+
+import cv2
+import numpy as np
+
+Color = tuple[int, int, int]
+
+BACKGROUND: Color = (16, 20, 26)
+INK: Color = (226, 230, 236)
+FAINT: Color = (70, 78, 90)
+UNASSIGNED: Color = (92, 98, 108)
+"""Points of no cluster."""
+ESTIMATE: Color = (255, 190, 40)
+"""A box of the detector, and a right one where there is truth."""
+FALSE_ALARM: Color = (255, 70, 70)
+TRUTH: Color = (70, 225, 120)
+MISS: Color = (255, 90, 235)
+HULL: Color = (120, 215, 255)
+
+LOW_M, HIGH_M = -0.3, 3.0
+"""Heights above the ground that the colour scale spans: a little below the road to a van's roof."""
+
+GOLDEN_TURN = 0.61803398875
+"""Hues that advance by this share of the circle never come close for neighbouring ids."""
+
+
+def color_by_height(height: np.ndarray, *, low_m: float = LOW_M, high_m: float = HIGH_M) -> np.ndarray:
+    """Colours heights from blue (low) over green to red (high).
+
+    Args:
+      height: (n,) real numbers, m.
+      low_m: height of the lowest colour, m.
+      high_m: height of the highest colour, m.
+
+    Returns:
+      (n, 3) uint8.
+
+    >>> color_by_height(np.array([0.0, 2.0])).shape
+    (2, 3)
+    """
+    share = (np.asarray(height, np.float64) - low_m) / (high_m - low_m)
+    level = (255 * np.clip(np.nan_to_num(share), 0.0, 1.0)).astype(np.uint8)
+    # The ends of the scale are too dark on a dark ground, so they are left out.
+    level = (20 + level.astype(np.int64) * 215 // 255).astype(np.uint8)
+    scale = cv2.applyColorMap(np.arange(256, dtype=np.uint8).reshape(-1, 1), cv2.COLORMAP_TURBO)
+    return np.ascontiguousarray(scale[:, 0, ::-1])[level]
+
+
+def color_by_id(ids: np.ndarray) -> np.ndarray:
+    """Colours ids so that neighbouring ones differ; the same id always has the same colour.
+
+    Args:
+      ids: (n,) integers; negative ones mean none and are grey.
+
+    Returns:
+      (n, 3) uint8.
+
+    >>> color_by_id(np.array([-1])).tolist()
+    [[92, 98, 108]]
+    """
+    ids = np.asarray(ids, np.int64)
+    hue = (ids * GOLDEN_TURN) % 1.0 * 180
+    saturation = 140 + (ids * 37) % 90
+    value = np.full(len(ids), 255)
+    hsv = np.stack([hue, saturation, value], axis=-1).astype(np.uint8)
+    if len(ids) == 0:
+        return np.zeros((0, 3), np.uint8)
+    colors = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0]
+    return np.where(ids[:, None] < 0, np.array(UNASSIGNED, np.uint8), colors).astype(np.uint8)
