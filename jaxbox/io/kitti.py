@@ -12,11 +12,16 @@ import dataclasses
 import math
 import os
 import pathlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
+from jaxbox.geometry import wrap_yaw
 from jaxbox.io._files import InputError, atomic_writer, read_text
+from jaxbox.projection import check_full_rank, compose_transforms, project_boxes, rigid_transform
+from jaxbox.types import Calibration, Detections, Label
 
 # Columns of the object labels, in the order of the development kit's readme.
 _FIELDS = (
@@ -27,6 +32,17 @@ _OBJECT_COLUMNS = (15, 16)
 _TRACKING_COLUMNS = (17, 18)
 
 DONT_CARE = "DontCare"
+
+IMAGE_SIZE_PX = (1242, 375)
+"""Width and height of most rectified images, for sweeps that come without one."""
+
+CAMERA = 2
+"""The left colour camera, in whose image the object and tracking labels are."""
+
+MIN_VISIBLE_FRACTION = 0.3
+"""Boxes with less of their 2D box in the image are no answer: the labels hold what the image shows."""
+
+_project_boxes = jax.jit(project_boxes)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,14 +211,239 @@ def read_label_folder(path: str | os.PathLike[str]) -> dict[str, list[KittiObjec
             labels[file.stem] = objects
             continue
         for item in objects:
+            if item.frame is None:
+                raise InputError(f"{file}: mixes object and tracking lines; split it into two files.")
             labels.setdefault(tracking_name(file.stem, item.frame), []).append(item)
     return labels
 
 
-def tracking_name(sequence: str, frame: int | None) -> str:
+def tracking_name(sequence: str, frame: int) -> str:
     """Name of a tracking sweep.
 
     >>> tracking_name("0000", 12)
     '0000_000012'
     """
     return f"{sequence}_{frame:06d}"
+
+
+def read_calibration(
+    path: str | os.PathLike[str], *, camera: int = CAMERA, image_size_px: tuple[int, int] = IMAGE_SIZE_PX
+) -> Calibration:
+    """Reads an object or tracking ``calib/*.txt`` (the two spell two of the keys differently).
+
+    Args:
+      path: the file.
+      camera: 0 to 3, whose P matrix is taken.
+      image_size_px: width and height, which the file does not hold.
+
+    Returns:
+      The camera, with T_rect_velo = R0_rect Tr_velo_to_cam.
+
+    Raises:
+      InputError: naming file and key, where one is missing, has a wrong number of values or a value
+        that is no finite number, or a matrix is singular.
+    """
+    entries = _read_entries(path)
+    rectification = _matrix(entries, ("R0_rect", "R_rect"), (3, 3), path)
+    extrinsics = _matrix(entries, ("Tr_velo_to_cam", "Tr_velo_cam"), (3, 4), path)
+    projection = _matrix(entries, (f"P{camera}",), (3, 4), path)
+    return _calibration(projection, rectification, extrinsics, image_size_px, path)
+
+
+def read_raw_calibration(
+    folder: str | os.PathLike[str],
+    *,
+    camera: int = CAMERA,
+    image_size_px: tuple[int, int] | None = None,
+) -> Calibration:
+    """Reads a raw recording's ``calib_velo_to_cam.txt`` and ``calib_cam_to_cam.txt``.
+
+    Args:
+      folder: the day's folder, which holds both.
+      camera: 0 to 3.
+      image_size_px: width and height; None takes the file's ``S_rect``.
+
+    Returns:
+      The camera, with T_rect_velo = R_rect_00 T_velo_to_cam: all cameras are rectified to camera 0.
+
+    Raises:
+      InputError: as `read_calibration`.
+    """
+    velo_path = pathlib.Path(folder) / "calib_velo_to_cam.txt"
+    cam_path = pathlib.Path(folder) / "calib_cam_to_cam.txt"
+    velo, cam = _read_entries(velo_path), _read_entries(cam_path)
+    rotation = _matrix(velo, ("R",), (3, 3), velo_path)
+    translation = _matrix(velo, ("T",), (3, 1), velo_path)
+    rectification = _matrix(cam, ("R_rect_00",), (3, 3), cam_path)
+    projection = _matrix(cam, (f"P_rect_{camera:02d}",), (3, 4), cam_path)
+    if image_size_px is None:
+        width, height = _matrix(cam, (f"S_rect_{camera:02d}",), (2,), cam_path)
+        image_size_px = (int(width), int(height))
+    extrinsics = np.hstack([rotation, translation])
+    return _calibration(projection, rectification, extrinsics, image_size_px, folder)
+
+
+def _read_entries(path: str | os.PathLike[str]) -> dict[str, list[str]]:
+    """Words after each line's key; the tracking files write some keys without the colon."""
+    lines = (line.split() for line in read_text(path).splitlines())
+    return {words[0].rstrip(":"): words[1:] for words in lines if words}
+
+
+def _matrix(
+    entries: dict[str, list[str]],
+    spellings: tuple[str, ...],
+    shape: tuple[int, ...],
+    path: str | os.PathLike[str],
+) -> np.ndarray:
+    key = next((spelling for spelling in spellings if spelling in entries), None)
+    if key is None:
+        present = ", ".join(entries) or "nothing"
+        raise InputError(
+            f"{path}: no key {' or '.join(spellings)}; it holds {present}. Give KITTI's calibration file."
+        )
+    words = entries[key]
+    if len(words) != math.prod(shape):
+        raise InputError(f"{path}: {key} has {len(words)} values; it must have {math.prod(shape)}.")
+    return np.array([_number(word, key, str(path)) for word in words]).reshape(shape)
+
+
+def _calibration(
+    projection: np.ndarray,
+    rectification: np.ndarray,
+    extrinsics: np.ndarray,
+    image_size_px: tuple[int, int],
+    path: str | os.PathLike[str],
+) -> Calibration:
+    T_rect_cam = rigid_transform(jnp.asarray(rectification), jnp.zeros(3))
+    T_cam_velo = rigid_transform(jnp.asarray(extrinsics[:, :3]), jnp.asarray(extrinsics[:, 3]))
+    try:
+        check_full_rank(np.asarray(T_rect_cam), "the rectifying rotation")
+        check_full_rank(np.asarray(T_cam_velo), "the LiDAR-to-camera transform")
+        check_full_rank(projection[:, :3], "the camera matrix")
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
+    return Calibration(
+        P_rect=jnp.asarray(projection, jnp.float32),
+        T_rect_velo=compose_transforms(T_rect_cam, T_cam_velo),
+        image_size_px=jnp.asarray(image_size_px, jnp.int32),
+    )
+
+
+def objects_from_detections(
+    detections: Detections,
+    calibration: Calibration,
+    *,
+    min_score: float = 0.0,
+    min_visible_fraction: float = MIN_VISIBLE_FRACTION,
+) -> list[KittiObject]:
+    """Turns one sweep's boxes into KITTI results: those that the camera sees.
+
+    Truncation and occlusion are -1, as results do not hold them. A box has no front, so `rotation_y` is
+    right up to half a turn.
+
+    Args:
+      detections: of one sweep, not a batch.
+      calibration: the camera whose image the 2D boxes are in.
+      min_score: lower scores are left out.
+      min_visible_fraction: boxes with a smaller part of their 2D box in the image are left out; 0 keeps
+        every box that the image touches.
+
+    Returns:
+      One object a box, best score first.
+    """
+    center, size, yaw = detections.center, detections.size, detections.yaw
+    image = _project_boxes(center, size, yaw, calibration)
+    keep = np.asarray(detections.valid & image.visible)
+    keep &= np.asarray(detections.score) >= min_score
+    keep &= np.asarray(image.visible_fraction) >= min_visible_fraction
+    location, rotation_y = _kitti_pose(np.asarray(center), np.asarray(size), np.asarray(yaw), calibration)
+    rows = np.flatnonzero(keep)
+    length, width, height = np.asarray(size, np.float64).T
+    boxes_px, score = np.asarray(image.boxes_px, np.float64), np.asarray(detections.score)
+    label = np.asarray(detections.label)
+    return [
+        KittiObject(
+            type=Label(label[row]).name.title(),
+            truncation=-1.0,
+            occlusion=-1,
+            alpha=observation_angle(rotation_y[row], location[row]),
+            box_px=boxes_px[row],
+            height=float(height[row]),
+            width=float(width[row]),
+            length=float(length[row]),
+            location=location[row],
+            rotation_y=float(rotation_y[row]),
+            score=float(score[row]),
+        )
+        for row in rows
+    ]
+
+
+def _kitti_pose(
+    center: np.ndarray, size: np.ndarray, yaw: np.ndarray, calibration: Calibration
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bottom centre (n, 3) and `rotation_y` (n,), rectified camera frame, of boxes in the LiDAR frame."""
+    T_rect_velo = np.asarray(calibration.T_rect_velo, np.float64)
+    location = center @ T_rect_velo[:3, :3].T + T_rect_velo[:3, 3]
+    # The camera's y points down, and KITTI's box stands upright along it: its bottom is h/2 below.
+    location[:, 1] += size[:, 2] / 2
+    # The length axis (cos yaw, sin yaw, 0) seen from above in the camera frame, whose own axis at
+    # rotation_y is (cos ry, 0, -sin ry): a turn about a y that points down takes x toward -z.
+    x, z = _ground_axes(T_rect_velo) @ np.stack([np.cos(yaw), np.sin(yaw)])
+    return location, np.arctan2(-z, x)
+
+
+def _ground_axes(T_rect_velo: np.ndarray) -> np.ndarray:
+    """(2, 2): x and z in the camera frame of the LiDAR frame's x and y axes, for an upright camera."""
+    return T_rect_velo[np.ix_([0, 2], [0, 1])]
+
+
+def boxes_from_objects(
+    objects: Sequence[KittiObject], calibration: Calibration
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Boxes of KITTI objects in the LiDAR frame: the inverse of `objects_from_detections`.
+
+    Args:
+      objects: n objects with a 3D box.
+      calibration: of their sweep.
+
+    Returns:
+      center: (n, 3) float64, m, sensor frame, the box's centre.
+      size: (n, 3) float64, m: length >= width, height; a pedestrian's may have to change places.
+      yaw: (n,) float64, rad, in [-pi/2, pi/2).
+
+    Raises:
+      ValueError: where one is a DontCare region, which has no 3D box.
+    """
+    if any(item.is_dont_care for item in objects):
+        raise ValueError("a DontCare region has no 3D box; leave out objects with is_dont_care.")
+    T_rect_velo = np.asarray(calibration.T_rect_velo, np.float64)
+    size = np.array([[item.length, item.width, item.height] for item in objects]).reshape(-1, 3)
+    center = np.array([item.location for item in objects]).reshape(-1, 3)
+    center[:, 1] -= size[:, 2] / 2
+    center = np.linalg.solve(T_rect_velo[:3, :3], (center - T_rect_velo[:3, 3]).T).T
+    rotation_y = np.array([item.rotation_y for item in objects])
+    x, y = np.linalg.solve(_ground_axes(T_rect_velo), np.stack([np.cos(rotation_y), -np.sin(rotation_y)]))
+    across = size[:, 1] > size[:, 0]
+    size[across, :2] = size[across, 1::-1]
+    yaw = wrap_yaw(jnp.asarray(np.arctan2(y, x) + across * np.pi / 2))
+    return center, size, np.asarray(yaw, np.float64)
+
+
+def observation_angle(rotation_y: float, location: np.ndarray) -> float:
+    """KITTI's alpha: the turn of the object relative to the ray it is seen along.
+
+    alpha = rotation_y - atan2(x, z), so that objects of one alpha look alike wherever they stand.
+
+    Args:
+      rotation_y: rad.
+      location: (3,) m, rectified camera frame.
+
+    Returns:
+      rad, in (-pi, pi].
+
+    >>> observation_angle(0.0, np.array([0.0, 1.6, 10.0]))
+    0.0
+    """
+    turn = rotation_y - math.atan2(location[0], location[2])
+    return math.pi - (math.pi - turn) % math.tau
