@@ -109,12 +109,13 @@ def _draw_boxes(
 ) -> list[tuple[str, Color]]:
     boxes = boxes or BoxSet(center=np.zeros((0, 3)), size=np.zeros((0, 3)), yaw=np.zeros(0))
     box_colors, truth_colors = choose_colors(boxes, truth, judged)
-    if truth is not None:
-        for corners, color in zip(frame.to_pixels(truth.footprints()), truth_colors, strict=True):
-            draw_polygon(picture, corners, color, thickness_px=1)
     footprints = frame.to_pixels(boxes.footprints())
     for corners, color in zip(footprints, box_colors, strict=True):
         draw_polygon(picture, corners, color)
+    if truth is not None:
+        # On top and thin: a right estimate would hide it.
+        for corners, color in zip(frame.to_pixels(truth.footprints()), truth_colors, strict=True):
+            draw_polygon(picture, corners, color, thickness_px=1)
     for corners, caption, color in zip(footprints, boxes.captions, box_colors, strict=False):
         draw_text(picture, caption, (corners[:, 0].max() + 4, corners[:, 1].min()), color, scale=0.4)
     return legend_entries(box_colors, truth_colors)

@@ -7,7 +7,7 @@ Color = tuple[int, int, int]
 
 BACKGROUND: Color = (16, 20, 26)
 INK: Color = (226, 230, 236)
-FAINT: Color = (70, 78, 90)
+FAINT: Color = (96, 106, 120)
 UNASSIGNED: Color = (92, 98, 108)
 """Points of no cluster."""
 ESTIMATE: Color = (255, 190, 40)
@@ -20,6 +20,8 @@ HULL: Color = (120, 215, 255)
 LOW_M, HIGH_M = -0.3, 3.0
 """Heights above the ground that the colour scale spans: a little below the road to a van's roof."""
 
+PALETTE_SIZE = 512
+"""Ids so far apart share a colour."""
 GOLDEN_TURN = 0.61803398875
 """Hues that advance by this share of the circle never come close for neighbouring ids."""
 
@@ -59,11 +61,12 @@ def color_by_id(ids: np.ndarray) -> np.ndarray:
     [[92, 98, 108]]
     """
     ids = np.asarray(ids, np.int64)
+    return np.where(ids[:, None] < 0, np.array(UNASSIGNED, np.uint8), _palette()[ids % PALETTE_SIZE])
+
+
+def _palette() -> np.ndarray:
+    """(PALETTE_SIZE, 3) uint8, always computed as a whole: OpenCV rounds short rows otherwise."""
+    ids = np.arange(PALETTE_SIZE)
     hue = (ids * GOLDEN_TURN) % 1.0 * 180
-    saturation = 140 + (ids * 37) % 90
-    value = np.full(len(ids), 255)
-    hsv = np.stack([hue, saturation, value], axis=-1).astype(np.uint8)
-    if len(ids) == 0:
-        return np.zeros((0, 3), np.uint8)
-    colors = cv2.cvtColor(hsv[None], cv2.COLOR_HSV2RGB)[0]
-    return np.where(ids[:, None] < 0, np.array(UNASSIGNED, np.uint8), colors).astype(np.uint8)
+    hsv = np.stack([hue, 140 + (ids * 37) % 90, np.full(PALETTE_SIZE, 255)], axis=-1)
+    return cv2.cvtColor(hsv.astype(np.uint8)[None], cv2.COLOR_HSV2RGB)[0]

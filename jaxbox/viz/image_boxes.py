@@ -34,10 +34,9 @@ def draw_image_boxes(
     """
     picture = np.ascontiguousarray(image).copy()
     box_colors, truth_colors = choose_colors(boxes, truth, judged)
-    in_view = 0
+    in_view = _draw_set(picture, calibration, boxes, box_colors, thickness_px=2)
     if truth is not None:
         _draw_set(picture, calibration, truth, truth_colors, thickness_px=1)
-    in_view = _draw_set(picture, calibration, boxes, box_colors, thickness_px=2)
     # Of what lies outside the image nothing is seen, so only what is drawn is counted.
     seen_truth = [] if truth is None else truth_colors
     seen = [color for color, shown in zip(box_colors, in_view, strict=True) if shown]

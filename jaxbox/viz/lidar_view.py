@@ -88,11 +88,11 @@ def draw_lidar_view(
     _draw_points_3d(picture, xyz, colors, camera)
     boxes = boxes or BoxSet(center=np.zeros((0, 3)), size=np.zeros((0, 3)), yaw=np.zeros(0))
     box_colors, truth_colors = choose_colors(boxes, truth, judged)
+    for segments, color in zip(boxes.segments(), box_colors, strict=True):
+        _draw_segments_3d(picture, segments, camera, color, thickness_px=2)
     if truth is not None:
         for segments, color in zip(truth.segments(), truth_colors, strict=True):
             _draw_segments_3d(picture, segments, camera, color, thickness_px=1)
-    for segments, color in zip(boxes.segments(), box_colors, strict=True):
-        _draw_segments_3d(picture, segments, camera, color, thickness_px=2)
     draw_legend(picture, legend_entries(box_colors, truth_colors), title=title)
     return picture
 
