@@ -201,6 +201,10 @@ class Clusters:
     """(N,) int32: row of each point's cluster, or K where it has none."""
     num_points: jax.Array
     """(K,) int32: points of each cluster; 0 for an empty row."""
+    min_height: jax.Array
+    """(K,) float32, m: height above the ground of the cluster's lowest point; 0 for an empty row."""
+    max_height: jax.Array
+    """(K,) float32, m: height above the ground of the cluster's highest point; 0 for an empty row."""
     num_clusters: jax.Array
     """() int32: clusters that pass the gates, which may exceed K."""
     num_cells: jax.Array

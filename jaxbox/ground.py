@@ -1,0 +1,331 @@
+"""Ground removal: RANSAC planes (paper, Algorithm I), and a ground grid for uneven roads."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+from jaxbox.masked import compact
+from jaxbox.types import GroundPlane
+
+CANDIDATE_CELL_M = 1.0
+"""Cells whose lowest points are candidates: wide enough that most cells near by see the road."""
+
+FAR_FILL_WEIGHT = 0.02
+"""Weight of the wide Gaussian where the narrow one has no ground cell."""
+
+FAR_FILL_PRIOR = 0.015
+"""Weight of the plane itself where the wide Gaussian has none either."""
+
+GAUSSIAN_TRUNCATION = 3.0
+"""Gaussians reach so many standard deviations, as in scipy.ndimage.gaussian_filter(truncate=3)."""
+
+
+def cell_minima(
+    xyz: jax.Array, mask: jax.Array, *, half_x_m: float, half_y_m: float
+) -> tuple[jax.Array, jax.Array]:
+    """The lowest point of each 1 m cell round the sensor: candidates for the ground.
+
+    Args:
+      xyz: (N, 3) float32, m, sensor frame.
+      mask: (N,) bool, points that count.
+      half_x_m: static, cells cover |x| below it.
+      half_y_m: static, cells cover |y| below it.
+
+    Returns:
+      candidates: (C, 3) float32, m: the cell's centre and its lowest z; 0 where it is empty.
+      occupied: (C,) bool.
+
+    Reference: oracle `jaxbox.reference.cell_minima`.
+    """
+    columns = round(2 * half_y_m / CANDIDATE_CELL_M)
+    rows = round(2 * half_x_m / CANDIDATE_CELL_M)
+    inside = mask & (jnp.abs(xyz[:, 0]) < half_x_m) & (jnp.abs(xyz[:, 1]) < half_y_m)
+    i = jnp.floor((xyz[:, 0] + half_x_m) / CANDIDATE_CELL_M).astype(jnp.int32)
+    j = jnp.floor((xyz[:, 1] + half_y_m) / CANDIDATE_CELL_M).astype(jnp.int32)
+    cell = jnp.where(inside, i * columns + j, rows * columns)
+    lowest = jnp.full(rows * columns, jnp.inf).at[cell].min(xyz[:, 2], mode="drop")
+    occupied = jnp.isfinite(lowest)
+    index = jnp.arange(rows * columns)
+    x = (index // columns + 0.5) * CANDIDATE_CELL_M - half_x_m
+    y = (index % columns + 0.5) * CANDIDATE_CELL_M - half_y_m
+    candidates = jnp.stack([x, y, jnp.where(occupied, lowest, 0)], axis=1)
+    return candidates, occupied
+
+
+def spread_points(
+    xyz: jax.Array, mask: jax.Array, num_points: jax.Array, *, num_candidates: int
+) -> tuple[jax.Array, jax.Array]:
+    """Points spread evenly over the sweep: the paper's candidates for the ground.
+
+    Args:
+      xyz: (N, 3) float32, m, sensor frame.
+      mask: (N,) bool, points that count.
+      num_points: () int32, rows that are no padding.
+      num_candidates: static, C.
+
+    Returns:
+      candidates: (C, 3) float32, m.
+      chosen: (C,) bool: those that count.
+    """
+    # Quotient and remainder apart, so that the product stays within int32.
+    rows = jnp.minimum(num_points, xyz.shape[0])
+    j = jnp.arange(num_candidates)
+    index = j * (rows // num_candidates) + j * (rows % num_candidates) // num_candidates
+    return xyz[index], mask[index] & (rows > 0)
+
+
+def fit_ground_plane(
+    candidates: jax.Array,
+    mask: jax.Array,
+    key: jax.Array,
+    *,
+    num_hypotheses: int,
+    num_refits: int,
+    tolerance_m: jax.Array | float,
+    max_slope_deg: jax.Array | float,
+    min_inlier_fraction: jax.Array | float,
+) -> GroundPlane:
+    """The plane with the most support: RANSAC, all hypotheses at once, then refits on all inliers.
+
+    A hypothesis is the plane z = a x + b y + c through three random candidates; its support is the
+    number of candidates within the tolerance of it. Planes steeper than the gate have none.
+
+    Args:
+      candidates: (C, 3) float32, m.
+      mask: (C,) bool.
+      key: JAX random key; the same key gives the same bits.
+      num_hypotheses: static, R.
+      num_refits: static, least-squares refits of the best plane.
+      tolerance_m: m.
+      max_slope_deg: degrees.
+      min_inlier_fraction: of the candidates.
+
+    Returns:
+      The plane; `found` is False, and the plane level through the lowest candidate (or z = 0 where
+      there is none), when too few candidates agree.
+
+    Reference: paper, Algorithm I; oracle `jaxbox.reference.fit_ground_plane`.
+    """
+    max_grade = jnp.tan(jnp.deg2rad(max_slope_deg))
+
+    def inliers(plane: jax.Array) -> jax.Array:
+        return mask & (jnp.abs(plane_residual(candidates, plane)) < tolerance_m) & _is_level(plane, max_grade)
+
+    index, count = compact(mask, mask.shape[0])
+    draws = jax.random.uniform(key, (num_hypotheses, 3))
+    picks = index[jnp.minimum((draws * count).astype(jnp.int32), jnp.maximum(count - 1, 0))]
+    planes = jax.vmap(_plane_through)(candidates[jnp.minimum(picks, mask.shape[0] - 1)])
+    support = jax.lax.map(lambda plane: jnp.sum(inliers(plane)), planes, batch_size=8)
+    plane = planes[jnp.argmax(support)]
+    for _ in range(num_refits):
+        plane = _refit(candidates, inliers(plane), plane)
+    num_inliers = jnp.sum(inliers(plane))
+    found = (num_inliers >= 3) & (num_inliers >= min_inlier_fraction * count)
+    lowest = jnp.min(jnp.where(mask, candidates[:, 2], jnp.inf))
+    level = jnp.array([0.0, 0.0, 1.0]) * jnp.where(jnp.isfinite(lowest), lowest, 0)
+    return GroundPlane(jnp.where(found, plane, level), found, jnp.where(found, num_inliers, 0))
+
+
+def fit_ground_planes(
+    candidates: jax.Array, mask: jax.Array, key: jax.Array, *, max_planes: int, tolerance_m: jax.Array | float,
+    **options: jax.Array | float,
+) -> tuple[GroundPlane, jax.Array]:  # fmt: skip
+    """Fits plane after plane, each to the candidates that the ones before leave over.
+
+    Args:
+      candidates: (C, 3) float32, m.
+      mask: (C,) bool.
+      key: JAX random key.
+      max_planes: static, rounds (Algorithm I, "repeat ... until all the points are covered").
+      tolerance_m: m, see `fit_ground_plane`.
+      **options: see `fit_ground_plane`.
+
+    Returns:
+      first: the first plane, which carries the most support.
+      planes: (max_planes, 3) float32: all of them; the first again where a round found none.
+    """
+    first = None
+    planes = []
+    for round_key in jax.random.split(key, max_planes):
+        plane = fit_ground_plane(candidates, mask, round_key, tolerance_m=tolerance_m, **options)  # pyright: ignore
+        first = plane if first is None else first
+        planes.append(jnp.where(plane.found, plane.coefficients, first.coefficients))
+        covered = jnp.abs(plane_residual(candidates, plane.coefficients)) < tolerance_m
+        mask = mask & ~(covered & plane.found)
+    return first, jnp.stack(planes)
+
+
+def plane_residual(xyz: jax.Array, plane: jax.Array) -> jax.Array:
+    """Height over a plane: z - (a x + b y + c).
+
+    Args:
+      xyz: (..., 3) float32, m.
+      plane: (3,) float32: a, b, c.
+
+    Returns:
+      (...) float32, m.
+    """
+    return xyz[..., 2] - (plane[0] * xyz[..., 0] + plane[1] * xyz[..., 1] + plane[2])
+
+
+def height_above_planes(xyz: jax.Array, planes: jax.Array, *, tolerance_m: jax.Array | float) -> jax.Array:
+    """Height over the highest plane that a point is not below (by more than the tolerance).
+
+    Args:
+      xyz: (N, 3) float32, m.
+      planes: (P, 3) float32.
+      tolerance_m: m.
+
+    Returns:
+      (N,) float32, m; a point below all planes gets its height over the lowest one there.
+    """
+    residual = jnp.stack([plane_residual(xyz, plane) for plane in planes])
+    above = jnp.min(jnp.where(residual >= -tolerance_m, residual, jnp.inf), axis=0)
+    return jnp.where(jnp.isfinite(above), above, jnp.max(residual, axis=0))
+
+
+def _plane_through(corners: jax.Array) -> jax.Array:
+    """Plane (a, b, c) through three points (3, 3); not finite where they are in a vertical plane."""
+    normal = jnp.cross(corners[1] - corners[0], corners[2] - corners[0])
+    a, b = -normal[0] / normal[2], -normal[1] / normal[2]
+    return jnp.stack([a, b, corners[0, 2] - a * corners[0, 0] - b * corners[0, 1]])
+
+
+def _is_level(plane: jax.Array, max_grade: jax.Array) -> jax.Array:
+    # A plane that is not finite compares False, and so has no support.
+    return jnp.hypot(plane[0], plane[1]) <= max_grade
+
+
+def _refit(candidates: jax.Array, inliers: jax.Array, plane: jax.Array) -> jax.Array:
+    """Least-squares plane through the inliers, about their mean: float32 sums would cancel else."""
+    weight = inliers / jnp.maximum(jnp.sum(inliers), 1)
+    mean = weight @ jnp.where(inliers[:, None], candidates, 0)
+    centred = jnp.where(inliers[:, None], candidates - mean, 0)
+    cov = (centred * weight[:, None]).T @ centred
+    determinant = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
+    a = (cov[0, 2] * cov[1, 1] - cov[1, 2] * cov[0, 1]) / determinant
+    b = (cov[1, 2] * cov[0, 0] - cov[0, 2] * cov[0, 1]) / determinant
+    refit = jnp.stack([a, b, mean[2] - a * mean[0] - b * mean[1]])
+    # Inliers on one line leave the plane open: keep the one that they came from.
+    spread = determinant > 1e-4 * (cov[0, 0] + cov[1, 1]) ** 2
+    return jnp.where(spread, refit, plane)
+
+
+def fit_ground_surface(
+    xyz: jax.Array,
+    mask: jax.Array,
+    plane: jax.Array,
+    *,
+    cell_m: float,
+    half_m: float,
+    num_envelope_rounds: int,
+    max_grade: jax.Array | float,
+    band_below_m: jax.Array | float,
+    band_below_grade: jax.Array | float,
+    band_above_m: jax.Array | float,
+    band_above_grade: jax.Array | float,
+    blind_radius_m: jax.Array | float,
+    envelope_margin_m: jax.Array | float,
+    smoothing_m: jax.Array | float,
+) -> jax.Array:
+    """Height of the ground over the plane, on a grid, where the road is not flat.
+
+    The lowest residual of each cell, where it lies near the plane, is ground if no ground cell near by
+    is so much lower that the slope between would pass the limit; the rest is filled by Gaussians.
+
+    Args:
+      xyz: (N, 3) float32, m.
+      mask: (N,) bool, points that count.
+      plane: (3,) float32.
+      cell_m: static, edge of the cells.
+      half_m: static, the grid covers |x|, |y| below it.
+      num_envelope_rounds: static, cells over which the slope limit spreads.
+      max_grade: the slope limit, m/m.
+      band_below_m: how far below the plane a ground point may be, m.
+      band_below_grade: growth of that with range, m/m.
+      band_above_m: how far above, m.
+      band_above_grade: growth of that with range, m/m.
+      blind_radius_m: nearer points are the carrier vehicle, m.
+      envelope_margin_m: how far above the envelope a ground cell may be, m.
+      smoothing_m: standard deviation of the narrow Gaussian, m.
+
+    Returns:
+      (G, G) float32, m: height of the ground over the plane at the cells' centres.
+
+    Reference: oracle `jaxbox.reference.fit_ground_surface`.
+    """
+    n = round(2 * half_m / cell_m)
+    residual = plane_residual(xyz, plane)
+    rho = jnp.hypot(xyz[:, 0], xyz[:, 1])
+    near_plane = (residual > -band_below_m - band_below_grade * rho) & (
+        residual < band_above_m + band_above_grade * rho
+    )
+    index = jnp.floor((xyz[:, :2] + half_m) / cell_m).astype(jnp.int32)
+    inside = jnp.all((index >= 0) & (index < n), axis=1)
+    cell = jnp.where(mask & near_plane & inside & (rho > blind_radius_m), index[:, 0] * n + index[:, 1], n * n)
+    lowest = jnp.full(n * n, jnp.inf).at[cell].min(residual, mode="drop").reshape(n, n)
+    envelope = _lower_envelope(lowest, max_grade * cell_m, num_envelope_rounds)
+    ground = jnp.isfinite(lowest) & (lowest < envelope + envelope_margin_m)
+    return _smooth(jnp.where(ground, lowest, 0), ground.astype(jnp.float32), smoothing_m / cell_m)
+
+
+def _lower_envelope(lowest: jax.Array, step_m: jax.Array | float, num_rounds: int) -> jax.Array:
+    """The highest surface below the cells that rises by at most `step_m` a cell, near each cell."""
+    n = lowest.shape[0]
+
+    def spread(_: int, envelope: jax.Array) -> jax.Array:
+        e = jnp.pad(envelope, 1, constant_values=jnp.inf)
+        shifted = {(i, j): e[1 + i : 1 + i + n, 1 + j : 1 + j + n] for i in (-1, 0, 1) for j in (-1, 0, 1)}
+        straight = [v for (i, j), v in shifted.items() if abs(i) + abs(j) == 1]
+        diagonal = [v for (i, j), v in shifted.items() if abs(i) + abs(j) == 2]
+        beside = jnp.minimum(jnp.minimum(straight[0], straight[1]), jnp.minimum(straight[2], straight[3]))
+        across = jnp.minimum(jnp.minimum(diagonal[0], diagonal[1]), jnp.minimum(diagonal[2], diagonal[3]))
+        return jnp.minimum(envelope, jnp.minimum(beside + step_m, across + math.sqrt(2) * step_m))
+
+    return jax.lax.fori_loop(0, num_rounds, spread, lowest)
+
+
+def _smooth(height: jax.Array, weight: jax.Array, sigma_cells: jax.Array | float) -> jax.Array:
+    """Weighted Gaussian mean of the heights, filled from one four times as wide."""
+    wide, narrow = (_gaussian_matrix(height.shape[0], k * sigma_cells) for k in (4, 1))
+
+    def blur(kernel: jax.Array, grid: jax.Array) -> jax.Array:
+        # The Gaussian is separable, and a product with a banded matrix is the fastest convolution here.
+        return jnp.matmul(
+            jnp.matmul(kernel, grid, precision="highest"), kernel.T, precision="highest"
+        )
+
+    far = blur(wide, height) / (blur(wide, weight) + FAR_FILL_PRIOR)
+    return (blur(narrow, height) + FAR_FILL_WEIGHT * far) / (blur(narrow, weight) + FAR_FILL_WEIGHT)
+
+
+def _gaussian_matrix(n: int, sigma: jax.Array | float) -> jax.Array:
+    """(n, n) float32: row i holds the Gaussian taps of cell i; cells beyond the border count as 0."""
+    offset = jnp.arange(-(n - 1), n)
+    reach = jnp.floor(GAUSSIAN_TRUNCATION * sigma + 0.5)
+    taps = jnp.where(jnp.abs(offset) <= reach, jnp.exp(-0.5 * (offset / sigma) ** 2), 0)
+    taps = taps / jnp.sum(taps)
+    index = jnp.arange(n)
+    return taps[index[None, :] - index[:, None] + n - 1]
+
+
+def surface_height(surface: jax.Array, xy: jax.Array, *, cell_m: float, half_m: float) -> jax.Array:
+    """Height of the ground grid over the plane, bilinear between the cells' centres.
+
+    Args:
+      surface: (G, G) float32, m.
+      xy: (..., 2) float32, m; beyond the grid its border holds.
+      cell_m: static, edge of the cells.
+      half_m: static, the grid covers |x|, |y| below it.
+
+    Returns:
+      (...) float32, m.
+    """
+    n = surface.shape[0]
+    at = jnp.clip((xy + half_m) / cell_m - 0.5, 0, n - 1.001)
+    i, j = at[..., 0].astype(jnp.int32), at[..., 1].astype(jnp.int32)
+    u, v = at[..., 0] - i, at[..., 1] - j
+    near = surface[i, j] * (1 - v) + surface[i, j + 1] * v
+    far = surface[i + 1, j] * (1 - v) + surface[i + 1, j + 1] * v
+    return near * (1 - u) + far * u
