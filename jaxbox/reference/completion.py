@@ -1,0 +1,236 @@
+"""Correction for occluded vehicles: hypotheses for the sides out of sight, and the scene's direction."""
+
+import dataclasses
+
+import numpy as np
+
+from jaxbox.reference.evidence import Evidence, box_evidence
+
+NEUTRAL_OBJECTIVE = np.inf
+"""Objective of a box that was not chosen among hypotheses: it passes every gate."""
+INSIDE_MARGIN_M = 0.1
+"""A fitted point this far outside a hypothesis still counts as inside."""
+FACE_OVERHANG_M = 0.3
+"""A face speaks for the points up to this beyond its ends."""
+NEAR_M = 0.1
+"""Fitted points nearer to a visible face than this count as on it."""
+MAX_VOTE_POINTS = 150
+"""A cluster with more points has no more say about the scene's direction."""
+MAX_VOTE_EXTENT_M = 6.0
+"""A longer cluster has no more say about the scene's direction."""
+KEEP_NEAR, KEEP_FAR, KEEP_CENTRE = 0, 1, 2
+"""What stays where it was measured when an extent is completed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CompletedBox:
+    """A rectangle in the bird's-eye view, its hidden sides completed."""
+
+    box: np.ndarray
+    """(5,): x, y, length, width in m and yaw in rad, not wrapped."""
+    objective: float
+    """J, or `NEUTRAL_OBJECTIVE`."""
+    measured_length_m: float
+    """Extent of the fitted points along the box."""
+    measured_width_m: float
+    """Extent of the fitted points across the box."""
+
+
+def complete_extent(low: float, high: float, prior_m: float, keep: int) -> tuple[float, float]:
+    """Grows an interval to a length, if it is shorter.
+
+    Args:
+      low: m, coordinate along an axis through the sensor.
+      high: m.
+      prior_m: the length.
+      keep: `KEEP_NEAR` or `KEEP_FAR`, the end nearer to or farther from the sensor, or `KEEP_CENTRE`.
+
+    Returns:
+      Middle and length, m.
+
+    >>> complete_extent(5.0, 7.0, 4.0, KEEP_NEAR)
+    (7.0, 4.0)
+    """
+    length = max(prior_m, high - low)
+    if keep == KEEP_CENTRE:
+        return (low + high) / 2, length
+    if (keep == KEEP_NEAR) == (abs(low) < abs(high)):
+        return low + length / 2, length
+    return high - length / 2, length
+
+
+def complete_box(
+    xy: np.ndarray,
+    extents: np.ndarray,
+    *,
+    angle: float,
+    criterion_value: float,
+    evidence: Evidence | None,
+    mode: str,
+    length_m: float,
+    width_m: float,
+    max_length_m: float,
+    max_width_m: float,
+    num_rays: int,
+    free_weight: float,
+    free_length_weight: float,
+    inside_weight: float,
+    near_weight: float,
+    closeness_weight: float,
+    not_away_cost: float,
+) -> CompletedBox | None:
+    """Completes the rectangle round a cluster to the size of a vehicle class.
+
+    "evidence" tries each axis as the length, extended away from the sensor, with the width extended
+    away from it, towards it, or to both sides, and takes the largest objective
+    J = hit - free_weight free - free_length_weight free_length + inside_weight inside
+    + near_weight near + closeness_weight criterion - (not_away_cost unless the width extends away).
+    "away" takes the longer extent as the length and extends both away; "none" changes nothing.
+
+    Args:
+      xy: (n, 2) m, sensor frame: the fitted points.
+      extents: (4,) m: smallest and largest u, smallest and largest v (see `criterion_curve`).
+      angle: rad, of the u axis.
+      criterion_value: of the rectangle, with the preference for the scene's direction.
+      evidence: of the sweep, or None.
+      mode: "none", "away" or "evidence".
+      length_m: of the class.
+      width_m: of the class.
+      max_length_m: no such vehicle measures longer.
+      max_width_m: no such vehicle measures wider.
+      num_rays: rays a hypothesis.
+      free_weight: see above.
+      free_length_weight: see above.
+      inside_weight: see above.
+      near_weight: see above.
+      closeness_weight: see above.
+      not_away_cost: see above.
+
+    Returns:
+      The box, or None where the measured extents are too large for the class.
+    """
+    u0, u1, v0, v1 = extents
+    # Turning the axes by a quarter turn takes (u, v) to (v, -u).
+    readings = [(u0, u1, v0, v1, angle), (v0, v1, -u1, -u0, angle + np.pi / 2)]
+    if mode != "evidence":
+        readings = readings[:1] if u1 - u0 >= v1 - v0 else readings[1:]
+    readings = [r for r in readings if r[1] - r[0] <= max_length_m and r[3] - r[2] <= max_width_m]
+    if not readings:
+        return None
+    if mode != "evidence":
+        prior = (0.0, 0.0) if mode == "none" else (length_m, width_m)
+        box = _place(readings[0], *prior, KEEP_NEAR)
+        return _completed(readings[0], box, NEUTRAL_OBJECTIVE)
+    trials = [(reading, keep) for reading in readings for keep in (KEEP_NEAR, KEEP_FAR, KEEP_CENTRE)]
+    boxes = np.array([_place(reading, length_m, width_m, keep) for reading, keep in trials])
+    rays = box_evidence(boxes, evidence, num_rays=num_rays)
+    inside, near = point_agreement(boxes, xy)
+    objective = rays.hit - free_weight * rays.free - free_length_weight * rays.free_length
+    objective += inside_weight * inside + near_weight * near + closeness_weight * criterion_value
+    objective -= not_away_cost * np.array([keep != KEEP_NEAR for _, keep in trials])
+    best = int(np.argmax(objective))
+    return _completed(trials[best][0], boxes[best], float(objective[best]))
+
+
+def _place(
+    reading: tuple[float, float, float, float, float], length_m: float, width_m: float, keep_width: int
+) -> np.ndarray:
+    """(5,) box of a reading (interval along, interval across, yaw) grown to a size."""
+    along, length = complete_extent(reading[0], reading[1], length_m, KEEP_NEAR)
+    across, width = complete_extent(reading[2], reading[3], width_m, keep_width)
+    cos, sin = np.cos(reading[4]), np.sin(reading[4])
+    return np.array([cos * along - sin * across, sin * along + cos * across, length, width, reading[4]])
+
+
+def _completed(
+    reading: tuple[float, float, float, float, float], box: np.ndarray, objective: float
+) -> CompletedBox:
+    return CompletedBox(box, objective, reading[1] - reading[0], reading[3] - reading[2])
+
+
+def point_agreement(boxes: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How well points agree with boxes: share inside, and mean closeness to the visible faces.
+
+    Args:
+      boxes: (B, 5): x, y, length, width in m and yaw in rad.
+      xy: (n, 2) m, sensor frame, n >= 1.
+
+    Returns:
+      (B,) share of the points within the box and its margin, and (B,) mean of
+      .1 / max(distance to the nearest visible face, .1); both in [0, 1].
+    """
+    inside, near = np.zeros(len(boxes)), np.zeros(len(boxes))
+    for row, (x, y, length, width, yaw) in enumerate(boxes):
+        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+        local, sensor = (xy - [x, y]) @ turn, np.array([-x, -y]) @ turn
+        half = np.array([length, width]) / 2
+        inside[row] = np.mean((np.abs(local) < half + INSIDE_MARGIN_M).all(axis=1))
+        distance = np.full(len(xy), np.inf)
+        for axis in range(2):
+            beside = np.abs(local[:, 1 - axis]) < half[1 - axis] + FACE_OVERHANG_M
+            if abs(sensor[axis]) > half[axis]:
+                face = half[axis] if sensor[axis] > 0 else -half[axis]
+                to_face = np.where(beside, np.abs(local[:, axis] - face), np.inf)
+                distance = np.minimum(distance, to_face)
+        near[row] = np.mean(NEAR_M / np.maximum(distance, NEAR_M))
+    return inside, near
+
+
+def scene_direction(
+    yaw: np.ndarray,
+    extent_m: np.ndarray,
+    num_points: np.ndarray,
+    free_length: np.ndarray,
+    *,
+    num_angles: int,
+    sigma_deg: float,
+    min_extent_m: float,
+    max_free: float,
+) -> float | None:
+    """The direction modulo 90 degrees that most boxes of the sweep share, by a weighted vote.
+
+    Args:
+      yaw: (k,) rad.
+      extent_m: (k,) longer measured extent.
+      num_points: (k,) members of the cluster.
+      free_length: (k,) share of the box seen to be free.
+      num_angles: directions that are voted on: i 90 / num_angles degrees.
+      sigma_deg: a vote for d weighs exp(-(d / sigma)^2) at distance d.
+      min_extent_m: boxes with a shorter extent do not vote.
+      max_free: boxes with a larger share do not vote.
+
+    Returns:
+      Degrees in [0, 90), or None without voters.
+    """
+    votes = (extent_m >= min_extent_m) & (free_length <= max_free)
+    if not votes.any():
+        return None
+    weight = np.minimum(num_points[votes], MAX_VOTE_POINTS) * np.minimum(extent_m[votes], MAX_VOTE_EXTENT_M)
+    angles = np.arange(num_angles) * 90 / num_angles
+    distance = _turn_between_deg(angles[:, None], np.degrees(yaw[votes]))
+    return float(angles[np.argmax(np.exp(-((distance / sigma_deg) ** 2)) @ weight)])
+
+
+def direction_preference(
+    direction_deg: float | None, *, num_angles: int, weight: float, sigma_deg: float
+) -> np.ndarray:
+    """What each rotation of a rectangle gains for lying along the scene's direction.
+
+    Args:
+      direction_deg: from `scene_direction`; None gives zeros.
+      num_angles: A, rotations over 90 degrees.
+      weight: gain on the direction itself.
+      sigma_deg: width of the preference.
+
+    Returns:
+      (A,) weight exp(-(d / sigma)^2).
+    """
+    if direction_deg is None:
+        return np.zeros(num_angles)
+    distance = _turn_between_deg(np.arange(num_angles) * 90 / num_angles, direction_deg)
+    return weight * np.exp(-((distance / sigma_deg) ** 2))
+
+
+def _turn_between_deg(first: np.ndarray, second: np.ndarray | float) -> np.ndarray:
+    """Signed turn between axes of rectangles, modulo 90 degrees, in [-45, 45)."""
+    return (first - second + 45) % 90 - 45

@@ -1,0 +1,271 @@
+"""What each beam says about a box: hit, seen through (free) or hidden."""
+
+import dataclasses
+
+import numpy as np
+from scipy import ndimage
+
+SUPPORT_HALF_M = 100
+"""The ground support grid covers |x|, |y| below this in cells of 1 m."""
+SUPPORT_WINDOW = 7
+"""Ground points are counted over so many cells in x and y round a box's centre."""
+MIN_DESCENT_M = 1e-3
+"""A beam that falls less than this before its return is level and shows nothing below it."""
+FULL_BEAM = 1 - 1e-6
+"""A beam that is still above the lower height after this share of its length ends at its return."""
+MIN_ENTRY_M = 1.0
+"""Rays that enter a box nearer to the sensor than this are not counted."""
+HIT_BEFORE_M = 0.35
+"""A return this far before the entry is still a hit."""
+HIT_BEHIND_M = 0.6
+"""A return this far behind the entry is still a hit,"""
+HIT_EXIT_M = 0.25
+"""unless it is this far behind the exit."""
+DEEP_EXIT_M = 0.1
+"""A ray that hits nothing at the entry but something up to this behind the exit is deep."""
+FREE_BEHIND_M = 0.3
+"""Free space counts from this far behind the entry,"""
+FREE_BEFORE_M = 0.2
+"""up to this far before the exit."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Evidence:
+    """Hits and free space on a polar grid, and ground points on a square one."""
+
+    hit_sums: np.ndarray
+    """(azimuths, ranges + 1) int: returns between the hit heights in all range cells before."""
+    free_sums: np.ndarray
+    """(azimuths, ranges + 1) int: free range cells before."""
+    support: np.ndarray
+    """(200, 200) int: ground points in the 7 x 7 cells of 1 m round each."""
+    range_cell_m: float
+    """Length of a range cell."""
+
+
+@dataclasses.dataclass(frozen=True)
+class BoxEvidence:
+    """Shares of the rays over each of B boxes; the first four sum to 1, or to 0 without rays."""
+
+    hit: np.ndarray
+    """(B,): end at the faces towards the sensor."""
+    free: np.ndarray
+    """(B,): pass through."""
+    occluded: np.ndarray
+    """(B,): tell nothing."""
+    deep: np.ndarray
+    """(B,): end inside, behind the faces."""
+    free_length: np.ndarray
+    """(B,): length seen to be free over length within the box, all rays together."""
+
+
+def build_evidence(
+    xyz: np.ndarray,
+    height: np.ndarray,
+    *,
+    sensor_height_m: float,
+    num_azimuths: int,
+    num_ranges: int,
+    range_cell_m: float,
+    min_range_m: float,
+    hit_min_height_m: float,
+    hit_max_height_m: float,
+    free_min_height_m: float,
+    free_max_height_m: float,
+    end_gap_m: float,
+    support_height_m: float,
+) -> Evidence:
+    """Collects what the beams hit and what they passed through.
+
+    A beam to a return at range rho and height h is at height hs + t (h - hs) at range t rho, where
+    hs is the sensor's height. The space below it is free where that is between the free heights.
+
+    Args:
+      xyz: (n, 3) finite, m, sensor frame: all returns, ground included.
+      height: (n,) m above the ground.
+      sensor_height_m: height of the sensor above the ground.
+      num_azimuths: azimuth cells all round, from -pi.
+      num_ranges: range cells.
+      range_cell_m: length of a range cell.
+      min_range_m: nearer returns are left out.
+      hit_min_height_m: returns between these heights are hits,
+      hit_max_height_m: exclusive.
+      free_min_height_m: beams between these heights show free space.
+      free_max_height_m: see there.
+      end_gap_m: a beam that ends between them shows it up to this before its return.
+      support_height_m: points within this of the ground support it, exclusive.
+
+    Returns:
+      The evidence.
+    """
+    support = ground_support(xyz, height, support_height_m=support_height_m)
+    rho = np.hypot(xyz[:, 0], xyz[:, 1])
+    far = rho >= min_range_m
+    xyz, height, rho = xyz[far], height[far], rho[far]
+    azimuth = azimuth_cell(np.arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths)
+
+    hits = np.zeros((num_azimuths, num_ranges + 1), int)
+    hit = (height > hit_min_height_m) & (height < hit_max_height_m) & (rho < num_ranges * range_cell_m)
+    np.add.at(hits, (azimuth[hit], (rho[hit] / range_cell_m).astype(int)), 1)
+
+    start, end = _free_interval(
+        rho,
+        height,
+        sensor_height_m=sensor_height_m,
+        lowest_m=free_min_height_m,
+        highest_m=free_max_height_m,
+        end_gap_m=end_gap_m,
+    )
+    # Only cells that lie wholly within the interval are free.
+    first = np.minimum((start / range_cell_m).astype(int) + 1, num_ranges)
+    last = np.minimum((end / range_cell_m).astype(int), num_ranges)
+    passes = (end > start) & (last > first)
+    steps = np.zeros((num_azimuths, num_ranges + 1), int)
+    np.add.at(steps, (azimuth[passes], first[passes]), 1)
+    np.add.at(steps, (azimuth[passes], last[passes]), -1)
+    free = np.cumsum(steps, axis=1) > 0
+    return Evidence(_sums_before(hits), _sums_before(free), support, range_cell_m)
+
+
+def azimuth_cell(angle: np.ndarray, num_azimuths: int) -> np.ndarray:
+    """Azimuth cell of angles in rad, from -pi, all round.
+
+    >>> azimuth_cell(np.array([-np.pi, 0.0, np.pi]), 4).tolist()
+    [0, 2, 0]
+    """
+    return np.floor((angle + np.pi) / (2 * np.pi) * num_azimuths).astype(int) % num_azimuths
+
+
+def _sums_before(cells: np.ndarray) -> np.ndarray:
+    return np.cumsum(cells, axis=1) - cells
+
+
+def _free_interval(
+    rho: np.ndarray,
+    height: np.ndarray,
+    *,
+    sensor_height_m: float,
+    lowest_m: float,
+    highest_m: float,
+    end_gap_m: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ranges between which each beam is within the heights; empty for beams that do not fall."""
+    descent = height - sensor_height_m
+    falls = descent < -MIN_DESCENT_M
+    descent = np.where(falls, descent, -1.0)
+    enters = np.maximum((highest_m - sensor_height_m) / descent, 0.0)
+    leaves = np.minimum((lowest_m - sensor_height_m) / descent, 1.0)
+    end = rho * leaves - np.where(leaves >= FULL_BEAM, end_gap_m, 0.0)
+    return np.where(falls, rho * enters, 0.0), np.where(falls, end, 0.0)
+
+
+def ground_support(xyz: np.ndarray, height: np.ndarray, *, support_height_m: float) -> np.ndarray:
+    """Ground points in the window round each cell of 1 m.
+
+    Args:
+      xyz: (n, 3) finite, m, sensor frame.
+      height: (n,) m above the ground.
+      support_height_m: ground points are within this of the ground, exclusive.
+
+    Returns:
+      (200, 200) int.
+    """
+    ground = (np.abs(height) < support_height_m) & (np.abs(xyz[:, :2]) < SUPPORT_HALF_M).all(axis=1)
+    cell = np.floor(xyz[ground, :2] + SUPPORT_HALF_M).astype(int)
+    counts = np.zeros((2 * SUPPORT_HALF_M, 2 * SUPPORT_HALF_M), int)
+    np.add.at(counts, tuple(cell.T), 1)
+    window = np.ones(SUPPORT_WINDOW, int)
+    for axis in range(2):
+        counts = ndimage.correlate1d(counts, window, axis=axis, mode="constant")
+    return counts
+
+
+def support_at(xy: np.ndarray, evidence: Evidence) -> int:
+    """Ground points in the window round a place.
+
+    Args:
+      xy: (2,) m; beyond the grid its border holds.
+      evidence: of the sweep.
+
+    Returns:
+      The number.
+    """
+    x, y = np.clip(np.floor(xy + SUPPORT_HALF_M), 0, 2 * SUPPORT_HALF_M - 1).astype(int)
+    return int(evidence.support[x, y])
+
+
+def box_evidence(boxes: np.ndarray, evidence: Evidence | None, *, num_rays: int) -> BoxEvidence:
+    """Sends rays over each box, evenly over the azimuths that it spans, and asks the evidence.
+
+    Args:
+      boxes: (B, 5): x, y, length, width in m and yaw in rad.
+      evidence: of the sweep; None counts every ray as hit.
+      num_rays: rays a box.
+
+    Returns:
+      The shares.
+    """
+    if evidence is None:
+        one, zero = np.ones(len(boxes)), np.zeros(len(boxes))
+        return BoxEvidence(one, zero, zero, zero, zero)
+    angle = _ray_angles(boxes, num_rays)
+    entry, exit_ = _intersect(boxes, angle)
+    counted = (exit_ > entry) & (entry >= MIN_ENTRY_M)
+    azimuth = azimuth_cell(angle, len(evidence.hit_sums))
+    # Any range will do where the ray is not counted.
+    entry, exit_ = np.where(counted, entry, MIN_ENTRY_M), np.where(counted, exit_, MIN_ENTRY_M)
+
+    def cell(distance: np.ndarray, offset: int) -> np.ndarray:
+        index = np.floor(distance / evidence.range_cell_m).astype(int) + offset
+        return np.clip(index, 0, evidence.hit_sums.shape[1] - 1)
+
+    def between(sums: np.ndarray, first: np.ndarray, end: np.ndarray) -> np.ndarray:
+        return sums[azimuth, end] - sums[azimuth, first]
+
+    front = cell(entry - HIT_BEFORE_M, 0)
+    hits = between(evidence.hit_sums, front, cell(np.minimum(entry + HIT_BEHIND_M, exit_ + HIT_EXIT_M), 1))
+    all_hits = between(evidence.hit_sums, front, cell(exit_ + DEEP_EXIT_M, 1))
+    first, end = cell(entry + FREE_BEHIND_M, 1), cell(exit_ - FREE_BEFORE_M, 0)
+    length = counted * np.maximum(end - first, 0)
+    free = counted * between(evidence.free_sums, first, np.maximum(first, end))
+
+    hit = counted & (hits > 0)
+    through = counted & ~hit & (free > 0)
+    deep = counted & ~hit & ~through & (all_hits > 0)
+    total = np.maximum(counted.sum(axis=1), 1)
+    return BoxEvidence(
+        hit=hit.sum(axis=1) / total,
+        free=through.sum(axis=1) / total,
+        occluded=(counted & ~hit & ~through & ~deep).sum(axis=1) / total,
+        deep=deep.sum(axis=1) / total,
+        free_length=free.sum(axis=1) / np.maximum(length.sum(axis=1), 1),
+    )
+
+
+def _ray_angles(boxes: np.ndarray, num_rays: int) -> np.ndarray:
+    """(B, rays) azimuths, rad, in the middle of equal parts of the box's span."""
+    x, y, length, width, yaw = boxes.T[..., None]
+    ahead, left = np.array([1, -1, -1, 1]) * length / 2, np.array([1, 1, -1, -1]) * width / 2
+    corner_x = x + np.cos(yaw) * ahead - np.sin(yaw) * left
+    corner_y = y + np.sin(yaw) * ahead + np.cos(yaw) * left
+    middle = np.arctan2(y, x)
+    offset = np.arctan2(corner_y, corner_x) - middle
+    offset = (offset + np.pi) % (2 * np.pi) - np.pi
+    low, high = offset.min(axis=1, keepdims=True), offset.max(axis=1, keepdims=True)
+    return middle + low + (high - low) * (np.arange(num_rays) + 0.5) / num_rays
+
+
+def _intersect(boxes: np.ndarray, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(B, rays) distances from the sensor at which rays enter and leave; entry > exit for a miss."""
+    x, y, length, width, yaw = boxes.T[..., None]
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    entry, exit_ = np.full(angle.shape, -np.inf), np.full(angle.shape, np.inf)
+    for half, position, direction in (
+        (length / 2, x * cos + y * sin, np.cos(angle - yaw)),
+        (width / 2, -x * sin + y * cos, np.sin(angle - yaw)),
+    ):
+        # A ray along the face: any tiny slope has it wholly within, or wholly outside, the slab.
+        slope = np.where(np.abs(direction) > 1e-9, direction, 1e-9)
+        sides = np.stack([(position - half) / slope, (position + half) / slope])
+        entry, exit_ = np.maximum(entry, sides.min(axis=0)), np.minimum(exit_, sides.max(axis=0))
+    return entry, exit_

@@ -1,0 +1,89 @@
+"""Selection of the points to look at, and statistical filtering (paper, 3.1)."""
+
+import numpy as np
+from scipy import ndimage
+
+
+def select_points(xyz: np.ndarray, *, half_x_m: float, half_y_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Tells which points are finite, and which of those lie within the region.
+
+    Args:
+      xyz: (n, 3) m, sensor frame; NaN and infinity allowed.
+      half_x_m: the region is |x| below this.
+      half_y_m: the region is |y| below this.
+
+    Returns:
+      finite (n,) bool and valid (n,) bool, the finite points within the region.
+    """
+    finite = np.isfinite(xyz).all(axis=1).astype(bool)
+    within = (np.abs(xyz[:, 0]) < half_x_m) & (np.abs(xyz[:, 1]) < half_y_m)
+    return finite, finite & within
+
+
+def filter_outliers(
+    xyz: np.ndarray,
+    *,
+    half_x_m: float,
+    half_y_m: float,
+    cell_m: float,
+    num_levels: int,
+    num_iterations: int,
+    bandwidth_m: float,
+    num_std: float,
+    min_density: float,
+) -> np.ndarray:
+    """Mean shift on a grid; points far from their converged centroid, or alone, are outliers.
+
+    The window of a point is its cell and the 26 cells around, weighted (w, 1, w) along each axis
+    with w = exp(-(cell / bandwidth)^2 / 2). A point moves to its window's centroid, then to the
+    centroid of the window there, and so on; d is how far it got. Inliers have
+    d <= mean(d) + num_std std(d) and at least min_density of weight in their own window.
+
+    Args:
+      xyz: (n, 3) finite, m, sensor frame, within the region.
+      half_x_m: the grid covers |x| below this.
+      half_y_m: the grid covers |y| below this.
+      cell_m: edge of the cells.
+      num_levels: cells in height, centred on z = 0; points beyond join the end levels.
+      num_iterations: steps of the mean shift, at least 1.
+      bandwidth_m: standard deviation of the window.
+      num_std: t of the paper.
+      min_density: least weight in the window; a point alone in it weighs 1.
+
+    Returns:
+      (n,) bool, True for inliers.
+    """
+    if len(xyz) == 0:
+        return np.zeros(0, bool)
+    shape = np.array([round(2 * half_x_m / cell_m), round(2 * half_y_m / cell_m), num_levels])
+    half = np.array([half_x_m, half_y_m, num_levels * cell_m / 2])
+
+    def cell_of(points: np.ndarray) -> tuple[np.ndarray, ...]:
+        index = np.clip(np.floor((points + half) / cell_m), 0, shape - 1).astype(int)
+        return tuple(index.T)
+
+    xyz = xyz.astype(np.float64)
+    centroid, density = _window_means(
+        xyz, cell_of(xyz), tuple(shape), np.exp(-0.5 * (cell_m / bandwidth_m) ** 2)
+    )
+    mode = centroid[cell_of(xyz)]
+    for _ in range(num_iterations - 1):
+        cell = cell_of(mode)
+        mode = np.where(density[cell][:, None] > 0, centroid[cell], mode)
+    distance = np.linalg.norm(xyz - mode, axis=1)
+    near = distance <= distance.mean() + num_std * distance.std()
+    return near & (density[cell_of(xyz)] >= min_density)
+
+
+def _window_means(
+    xyz: np.ndarray, cell: tuple[np.ndarray, ...], shape: tuple[int, ...], side_weight: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted centroid (X, Y, Z, 3) and weight (X, Y, Z) of the points in each cell's window."""
+    sums = np.zeros((*shape, 4))
+    np.add.at(sums, cell, np.column_stack([xyz, np.ones(len(xyz))]))
+    for axis in range(3):
+        sums = ndimage.correlate1d(sums, [side_weight, 1.0, side_weight], axis=axis, mode="constant")
+    density = sums[..., 3]
+    occupied = density > 0
+    centroid = sums[..., :3] / np.where(occupied, density, 1.0)[..., None]
+    return centroid, density

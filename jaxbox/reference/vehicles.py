@@ -1,0 +1,197 @@
+"""Vehicle decision: points round a box, score, suppression."""
+
+import dataclasses
+
+import cv2
+import numpy as np
+from scipy.special import expit
+
+from jaxbox.config import ClassPrior
+
+
+@dataclasses.dataclass(frozen=True)
+class PointsAround:
+    """Points of the whole cloud in and round a box."""
+
+    inside: int
+    """Points of the vehicle's heights within the box and its margin."""
+    top_m: float
+    """Highest of them above the ground; 0 without any."""
+    overhead: int
+    """Higher points within the box and its margin."""
+    ring: int
+    """Points of the vehicle's heights in the ring round the margin."""
+
+
+def distance_outside(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """How far points lie outside a box, along its worse axis; negative inside.
+
+    Args:
+      xy: (n, 2) m.
+      box: (5,): x, y, length, width in m and yaw in rad.
+
+    Returns:
+      (n,) m.
+    """
+    x, y, length, width, yaw = box
+    dx, dy = xy[:, 0] - x, xy[:, 1] - y
+    along = np.abs(dx * np.cos(yaw) + dy * np.sin(yaw)) - length / 2
+    across = np.abs(-dx * np.sin(yaw) + dy * np.cos(yaw)) - width / 2
+    return np.maximum(along, across)
+
+
+def count_points_around(
+    box: np.ndarray,
+    xyz: np.ndarray,
+    height: np.ndarray,
+    *,
+    margin_m: float,
+    ring_m: float,
+    min_height_m: float,
+    count_max_height_m: float,
+    max_height_m: float,
+) -> PointsAround:
+    """Counts the points in and round a box.
+
+    Args:
+      box: (5,): x, y, length, width in m and yaw in rad.
+      xyz: (n, 3) m, sensor frame.
+      height: (n,) m above the ground.
+      margin_m: a point less than this outside counts as inside.
+      ring_m: a point farther outside than the margin but less than this is in the ring.
+      min_height_m: lower points are ground.
+      count_max_height_m: points from this on are overhead,
+      max_height_m: and from this on they are left out.
+
+    Returns:
+      The counts.
+    """
+    outside = distance_outside(xyz[:, :2], box)
+    within = outside < margin_m
+    counted = (height > min_height_m) & (height < count_max_height_m)
+    above = (height >= count_max_height_m) & (height < max_height_m)
+    return PointsAround(
+        inside=int((within & counted).sum()),
+        top_m=float(np.max(height, where=within & counted, initial=0.0)),
+        overhead=int((within & above).sum()),
+        ring=int((~within & (outside < ring_m) & counted).sum()),
+    )
+
+
+def score_box(
+    box: np.ndarray,
+    prior: ClassPrior,
+    *,
+    around: PointsAround,
+    objective: float,
+    measured_length_m: float,
+    measured_width_m: float,
+    num_members: int,
+    hit: float,
+    free_length: float,
+    support: float | None,
+    top_grade: float,
+    min_extent_m: float,
+    saturation_points: float,
+    sparseness_power: float,
+    free_scale: float,
+    ring_weight: float,
+    overhead_weight: float,
+    support_points: float,
+    objective_gate: float,
+    objective_softness: float,
+) -> float:
+    """How much a box looks like a vehicle of a class: a product of factors in [0, 1].
+
+    Args:
+      box: (5,): x, y, length, width in m and yaw in rad.
+      prior: the class.
+      around: points in and round the box.
+      objective: J of the completion.
+      measured_length_m: extent of the fitted points along the box.
+      measured_width_m: extent of the fitted points across the box.
+      num_members: points of the cluster.
+      hit: share of the rays that end at the box.
+      free_length: share of the box seen to be free.
+      support: ground points round the box, or None where they were not counted.
+      top_grade: a vehicle may be higher than its top by this times the range.
+      min_extent_m: 0 where both measured extents are shorter.
+      saturation_points: factor min(1, members / this)^power.
+      sparseness_power: see there.
+      free_scale: factor exp(-(free_length / this)^2).
+      ring_weight: factor exp(-weight ring / inside).
+      overhead_weight: factor exp(-weight overhead / inside).
+      support_points: factor min(1, (support + 1/2) / this).
+      objective_gate: factor 1 / (1 + exp(-(J - gate) / softness)).
+      objective_softness: see there.
+
+    Returns:
+      The score; 0 where a gate of the class closes.
+    """
+    allowance = top_grade * np.hypot(box[0], box[1])
+    top = around.top_m
+    if not (prior.min_height_m < top + allowance and top < prior.max_height_m):
+        return 0.0
+    if measured_length_m < min_extent_m and measured_width_m < min_extent_m:
+        return 0.0
+    height = min(max(float(prior.height_m), top), top + allowance)
+    score = _bell(box[2], prior.length_m, prior.length_below_m, prior.length_above_m)
+    score *= _bell(box[3], prior.width_m, prior.width_tolerance_m, prior.width_tolerance_m)
+    score *= _bell(height, prior.height_m, prior.height_tolerance_m, prior.height_tolerance_m)
+    score *= min(1.0, num_members / saturation_points) ** sparseness_power
+    score *= hit * np.exp(-((free_length / free_scale) ** 2))
+    clutter = ring_weight * around.ring + overhead_weight * around.overhead
+    score *= np.exp(-clutter / max(around.inside, 1))
+    if support is not None:
+        score *= min(1.0, (support + 0.5) / support_points)
+    return float(score * expit((objective - objective_gate) / objective_softness))
+
+
+def _bell(value, center, below, above) -> float:
+    """exp(-(d / w)^2), with another width on either side."""
+    return float(np.exp(-(((value - center) / (below if value < center else above)) ** 2)))
+
+
+def bev_iou(first: np.ndarray, second: np.ndarray) -> float:
+    """Overlap of two rectangles in the bird's-eye view: intersection over union.
+
+    Args:
+      first: (5,): x, y, length, width in m and yaw in rad.
+      second: (5,).
+
+    Returns:
+      In [0, 1]; 0 for two boxes without area.
+    """
+    # OpenCV works in float32: keep the numbers small.
+    offset = second[:2] - first[:2]
+    rectangles = [
+        ((0.0, 0.0), (first[2], first[3]), np.degrees(first[4])),
+        ((offset[0], offset[1]), (second[2], second[3]), np.degrees(second[4])),
+    ]
+    kind, corners = cv2.rotatedRectangleIntersection(*rectangles)
+    if kind == cv2.INTERSECT_NONE or corners is None:
+        return 0.0
+    shared = cv2.contourArea(cv2.convexHull(corners))
+    union = first[2] * first[3] + second[2] * second[3] - shared
+    return float(np.clip(shared / union, 0.0, 1.0)) if union > 0 else 0.0
+
+
+def suppress(boxes: np.ndarray, scores: np.ndarray, *, max_overlap: float) -> np.ndarray:
+    """Greedy suppression: of two overlapping boxes the one with the higher score stays.
+
+    Args:
+      boxes: (k, 5): x, y, length, width in m and yaw in rad.
+      scores: (k,); of equal ones the first goes first.
+      max_overlap: a larger IoU with a better box that stays suppresses.
+
+    Returns:
+      (d,) int, rows of the boxes that stay, best score first.
+    """
+    kept: list[int] = []
+    reach = np.hypot(boxes[:, 2], boxes[:, 3]) / 2
+    for row in np.argsort(-scores, kind="stable"):
+        gap = np.hypot(*(boxes[kept, :2] - boxes[row, :2]).T)
+        rivals = np.array(kept, int)[gap <= reach[kept] + reach[row]]
+        if all(bev_iou(boxes[row], boxes[rival]) <= max_overlap for rival in rivals):
+            kept.append(int(row))
+    return np.array(kept, int)
