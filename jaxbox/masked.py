@@ -133,3 +133,59 @@ def map_rows(function: Callable[[Any], Any], rows: Any, *, num_rows: jax.Array, 
     num_chunks = (jnp.minimum(num_rows, capacity) + chunk - 1) // chunk
     out = jax.lax.fori_loop(0, num_chunks, step, out)
     return jax.tree.map(lambda a: a[:capacity], out)
+
+
+def group_by(group: jax.Array, num_groups: int) -> tuple[jax.Array, jax.Array]:
+    """Orders rows by group, keeping their order within one.
+
+    Args:
+      group: (N,) int32, in [0, num_groups], the latter for rows of no group, which come last.
+      num_groups: static, K.
+
+    Returns:
+      order: (N,) int32 row indices.
+      start: (K + 1,) int32: group k is order[start[k]:start[k + 1]].
+
+    >>> order, start = group_by(jnp.array([1, 0, 2, 1]), 2)
+    >>> order.tolist(), start.tolist()
+    ([1, 0, 3, 2], [0, 1, 3])
+    """
+    size = group.shape[0]
+    index_bits, group_bits = size.bit_length(), num_groups.bit_length()
+    index = jnp.arange(size, dtype=jnp.uint32)
+    if index_bits + group_bits <= WORD_BITS:
+        # One packed word sorts several times faster than a key with its value.
+        packed = jax.lax.sort((group.astype(jnp.uint32) << index_bits) | index, is_stable=False)
+        order = packed & (2**index_bits - 1)
+    else:
+        order = jax.lax.sort((group, index), num_keys=1, is_stable=True)[1]
+    count = jnp.zeros(num_groups, jnp.int32).at[group].add(1, mode="drop")
+    end = prefix_sum(count)
+    return order.astype(jnp.int32), jnp.concatenate([jnp.zeros(1, jnp.int32), end])
+
+
+def fold_points(
+    points: jax.Array, count: jax.Array, init: Any, update: Callable[[Any, jax.Array, jax.Array], Any]
+) -> Any:
+    """Folds the points of many clusters into a wide state, one point of each cluster at a time.
+
+    A loop over points with a wide carry vectorises; a reduction over an inner axis does not (XLA, CPU).
+    The loop ends with the largest cluster of the batch.
+
+    Args:
+      points: (C, M, 2) float32.
+      count: (C,) int32, points of each cluster.
+      init: pytree of (C, ...) arrays, the state before the first point.
+      update: maps the state and x (C, 1), y (C, 1) to the next state.
+
+    Returns:
+      The state after the last point of each cluster.
+    """
+    by_point = jnp.swapaxes(points, 0, 1)
+
+    def step(m: jax.Array, state: Any) -> Any:
+        xy = by_point[m]
+        new = update(state, xy[:, :1], xy[:, 1:])
+        return jax.tree.map(lambda n, o: jnp.where((m < count)[:, None], n, o), new, state)
+
+    return jax.lax.fori_loop(0, jnp.minimum(jnp.max(count), points.shape[1]), step, init)

@@ -215,6 +215,44 @@ class Clusters:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
+class Rectangles:
+    """Rectangles in a frame turned by `angle`: u along it, v a quarter turn further."""
+
+    angle: jax.Array
+    """(P,) float32, rad, in [0, pi/2)."""
+    low: jax.Array
+    """(P, 2) float32, m: lower bounds of u and v, from the sensor."""
+    high: jax.Array
+    """(P, 2) float32, m: upper bounds of u and v."""
+    worth: jax.Array
+    """(P,) float32: the criterion (and preference) at this angle."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Boxes:
+    """Oriented boxes in the bird's-eye view, and what they were completed from."""
+
+    center: jax.Array
+    """(..., 2) float32, m."""
+    length: jax.Array
+    """(...) float32, m, along the yaw axis."""
+    width: jax.Array
+    """(...) float32, m."""
+    yaw: jax.Array
+    """(...) float32, rad, any turn."""
+    measured: jax.Array
+    """(..., 2) float32, m: length and width before completion."""
+    objective: jax.Array
+    """(...) float32: J, how well the box explains the evidence; NOT_A_BOX where no hypothesis fits."""
+
+
+NOT_A_BOX = -1e9
+"""`Boxes.objective` where the cluster is too large for the class."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
 class Hulls:
     """Convex hulls in the bird's-eye view, padded by repeating the last vertex."""
 
