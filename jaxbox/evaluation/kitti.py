@@ -1,0 +1,434 @@
+"""KITTI's object detection protocol: average precision in the image, of orientation, from above and in 3D.
+
+Follows the official C++ evaluator rule by rule, also where its rules surprise:
+
+- Labels beyond a difficulty's limits, and those of the neighbouring class, are neither found nor missed,
+  and the detections matched to them neither right nor wrong. So are detections lower than the limit in
+  the image; one of **any** class that is too low can still be matched to a label.
+- A DontCare region excuses the detections that it covers in the **image** metrics only: it has no box in 3D.
+- Scores are sampled where recall passes 0, 1/40, ... 1. Matching prefers the best score while these
+  thresholds are collected, and the best overlap while precision is measured at them.
+- There is at most one threshold a label, so with fewer than 41 labels even perfect answers stay below
+  100: every average precision comes with its **ceiling**.
+
+Reference: Geiger, Lenz, Urtasun, CVPR 2012, and the object development kit (evaluate_object.cpp); the 40
+recall samples are those of Simonelli et al., "Disentangling Monocular 3D Object Detection", ICCV 2019.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxbox.evaluation.iou import image_fractions, image_iou, paired_overlaps
+from jaxbox.io import KittiObject
+
+DIFFICULTIES = ("easy", "moderate", "hard")
+MIN_HEIGHT_PX = (40, 25, 25)
+MAX_OCCLUSION = (0, 1, 2)
+MAX_TRUNCATION = (0.15, 0.3, 0.5)
+"""Limits of the three difficulties, from the development kit."""
+
+MIN_OVERLAP: Mapping[str, float] = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
+"""The overlap that a match must exceed, for every metric, from the development kit."""
+
+METRICS = ("image", "orientation", "bev", "3d")
+SOFT_OVERLAPS = (0.60, 0.65, 0.70, 0.75)
+"""Overlaps that `soft_score` averages over: one borderline car weighs less than at .7 alone."""
+
+NUM_SAMPLES = 41
+_R11_STEP = 4
+_INVALID_ALPHA = -10
+_NEIGHBOURS = {"car": "van", "pedestrian": "person_sitting"}
+
+# Roles of labels and detections for one class and difficulty.
+_COUNTS, _IGNORED, _OTHER = 0, 1, -1
+
+Objects = Mapping[str, Sequence[KittiObject]]
+
+
+@dataclasses.dataclass(frozen=True)
+class PrecisionCurve:
+    """Precision (or orientation similarity) over recall, of one class, metric and difficulty."""
+
+    class_name: str
+    """Car, Pedestrian or Cyclist."""
+    metric: str
+    """One of `METRICS`."""
+    difficulty: str
+    """One of `DIFFICULTIES`."""
+    precision: np.ndarray
+    """(41,) float64 in [0, 1], at recall 0, 1/40, ..., 1: the best from there on."""
+    num_labels: int
+    """Labels of this class and difficulty."""
+    ceiling: np.ndarray
+    """(41,) float64: what perfect answers on the same frames reach."""
+
+    @property
+    def r11(self) -> float:
+        """Average precision over 11 samples from recall 0 on, in [0, 100]."""
+        return _average(self.precision, r11=True)
+
+    @property
+    def r40(self) -> float:
+        """Average precision over 40 samples without recall 0, in [0, 100]."""
+        return _average(self.precision, r11=False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Numbers and strings only, for JSON."""
+        return {
+            "class": self.class_name,
+            "metric": self.metric,
+            "difficulty": self.difficulty,
+            "r11": self.r11,
+            "r40": self.r40,
+            "ceiling_r11": _average(self.ceiling, r11=True),
+            "ceiling_r40": _average(self.ceiling, r11=False),
+            "num_labels": self.num_labels,
+            "precision": self.precision.tolist(),
+        }
+
+
+def _average(precision: np.ndarray, *, r11: bool) -> float:
+    return 100 * float(np.mean(precision[::_R11_STEP] if r11 else precision[1:]))
+
+
+@dataclasses.dataclass(frozen=True)
+class KittiEvaluation:
+    """Every curve of an evaluation, over all frames and by drive."""
+
+    num_frames: int
+    """Labelled frames."""
+    curves: tuple[PrecisionCurve, ...]
+    """Over all frames."""
+    by_drive: Mapping[str, tuple[PrecisionCurve, ...]]
+    """Over the frames of each drive; empty where no drives were given."""
+
+    def curve(self, class_name: str, metric: str, difficulty: str) -> PrecisionCurve:
+        """Returns the curve over all frames of one class, metric and difficulty.
+
+        Args:
+          class_name: as given to `evaluate`.
+          metric: one of `METRICS`.
+          difficulty: one of `DIFFICULTIES`.
+
+        Raises:
+          KeyError: where it was not evaluated.
+        """
+        for curve in self.curves:
+            if (curve.class_name, curve.metric, curve.difficulty) == (class_name, metric, difficulty):
+                return curve
+        raise KeyError(f"{class_name}, {metric}, {difficulty} was not evaluated.")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Numbers, strings, lists and dicts only, for JSON."""
+        return {
+            "num_frames": self.num_frames,
+            "num_drives": len(self.by_drive) or None,
+            "curves": [curve.to_dict() for curve in self.curves],
+            "by_drive": {drive: [c.to_dict() for c in curves] for drive, curves in self.by_drive.items()},
+        }
+
+
+def evaluate(
+    labels: Objects,
+    results: Objects,
+    *,
+    min_overlap: Mapping[str, float] = MIN_OVERLAP,
+    metrics: Sequence[str] = METRICS,
+    drives: Mapping[str, str] | None = None,
+) -> KittiEvaluation:
+    """Scores results against labels as the official KITTI evaluator does.
+
+    Args:
+      labels: ground truth of each frame, by name.
+      results: detections, each with a score, of each of these frames; those of other frames are not used.
+      min_overlap: for each class to evaluate, the overlap that a match must exceed.
+      metrics: some of `METRICS`.
+      drives: the drive of each frame, to evaluate each drive by itself too. Frames of one drive are
+        correlated, so the number of drives says more about a figure's worth than that of frames.
+
+    Returns:
+      A curve for each class, metric and difficulty. A class without labels or without detections has
+      precision 0, one without labels also ceiling 0. Orientation is 0 where a detection has none (-10).
+
+    Raises:
+      ValueError: for frames without results, detections without score, frames without a drive, or
+        unknown metrics.
+    """
+    unknown = sorted(set(metrics) - set(METRICS))
+    if unknown:
+        raise ValueError(f"metrics {unknown} are unknown; choose from {list(METRICS)}.")
+    frames = _build_frames(labels, results)
+    groups = _by_drive(labels, frames, drives) if drives is not None else {}
+    by_drive = {drive: _curves(groups[drive], min_overlap, metrics) for drive in sorted(groups)}
+    return KittiEvaluation(len(frames), _curves(frames, min_overlap, metrics), by_drive)
+
+
+def _by_drive(
+    names: Iterable[str], frames: Sequence["_Frame"], drives: Mapping[str, str]
+) -> dict[str, list["_Frame"]]:
+    groups: dict[str, list[_Frame]] = {}
+    for name, frame in zip(names, frames, strict=True):
+        if name not in drives:
+            raise ValueError(f"frame {name} has no drive; add it to drives.")
+        groups.setdefault(drives[name], []).append(frame)
+    return groups
+
+
+def soft_score(labels: Objects, results: Objects, *, class_name: str = "Car") -> float:
+    """Mean 3D average precision (R40) over `SOFT_OVERLAPS` and the moderate and hard difficulties.
+
+    A smoother figure than AP at one overlap, to compare two settings on few frames.
+
+    Args:
+      labels: ground truth of each frame, by name.
+      results: detections, each with a score, of each of these frames.
+      class_name: the class.
+
+    Returns:
+      In [0, 100].
+
+    Raises:
+      ValueError: as `evaluate`.
+    """
+    frames = _build_frames(labels, results)
+    curves = [_curves(frames, {class_name: overlap}, ("3d",)) for overlap in SOFT_OVERLAPS]
+    return float(np.mean([curve.r40 for group in curves for curve in group if curve.difficulty != "easy"]))
+
+
+def camera_boxes(objects: Sequence[KittiObject]) -> np.ndarray:
+    """Boxes of KITTI objects in the rectified camera frame turned to x forward, y left, z up.
+
+    Args:
+      objects: n of them; DontCare regions, which have no box, get size 0.
+
+    Returns:
+      (n, 7) float64, m and rad: x, y, z of the centre, length, width, height, yaw about z.
+    """
+    rows = [(*item.location, item.length, item.width, item.height, item.rotation_y) for item in objects]
+    columns = np.array(rows, float).reshape(-1, 7)
+    right, down, forward = columns[:, :3].T
+    size = np.maximum(columns[:, 3:6], 0)
+    # The location is the centre of the bottom face, and rotation_y turns clockwise seen from above.
+    return np.column_stack([forward, -right, size[:, 2] / 2 - down, size, -columns[:, 6] - np.pi / 2])
+
+
+def label_roles(labels: Sequence[KittiObject], class_name: str, level: int) -> np.ndarray:
+    """What each label is to one class and difficulty.
+
+    Args:
+      labels: n labels.
+      class_name: the class that is evaluated.
+      level: 0 easy, 1 moderate, 2 hard.
+
+    Returns:
+      (n,) int: 0 counts, 1 is ignored (too hard, or of the neighbouring class), -1 is another class.
+    """
+    return np.array([_label_role(label, class_name.lower(), level) for label in labels], int)
+
+
+def _label_role(label: KittiObject, class_name: str, level: int) -> int:
+    if label.type.lower() == _NEIGHBOURS.get(class_name):
+        return _IGNORED
+    if label.type.lower() != class_name:
+        return _OTHER
+    too_hard = (
+        label.occlusion > MAX_OCCLUSION[level]
+        or label.truncation > MAX_TRUNCATION[level]
+        or label.box_px[3] - label.box_px[1] < MIN_HEIGHT_PX[level]
+    )
+    return _IGNORED if too_hard else _COUNTS
+
+
+def _detection_role(detection: KittiObject, class_name: str, level: int) -> int:
+    # Whole pixels, and before the class is looked at: as the official evaluator does.
+    if int(abs(detection.box_px[1] - detection.box_px[3])) < MIN_HEIGHT_PX[level]:
+        return _IGNORED
+    return _COUNTS if detection.type.lower() == class_name.lower() else _OTHER
+
+
+@dataclasses.dataclass(frozen=True)
+class _Frame:
+    """One frame, with the overlaps that every class, difficulty and threshold shares."""
+
+    labels: Sequence[KittiObject]
+    detections: Sequence[KittiObject]
+    scores: np.ndarray
+    overlaps: Mapping[str, np.ndarray]
+    """(labels, detections) of each metric."""
+    excused: np.ndarray
+    """(detections,) largest fraction in the image within one DontCare region."""
+
+
+def _build_frames(labels: Objects, results: Objects) -> list[_Frame]:
+    missing = sorted(set(labels) - set(results))
+    if missing:
+        raise ValueError(
+            f"{len(missing)} labelled frames have no results, the first is {missing[0]}; "
+            "give an empty list for a frame in which nothing was found."
+        )
+    pairs = [(labels[name], results[name]) for name in labels]
+    for name in labels:
+        if any(item.score is None for item in results[name]):
+            raise ValueError(f"frame {name} has a detection without score; results need 16 columns.")
+    spatial = _spatial_overlaps(pairs)
+    return [_build_frame(*pair, *overlaps) for pair, overlaps in zip(pairs, spatial, strict=True)]
+
+
+def _spatial_overlaps(
+    pairs: Sequence[tuple[Sequence[KittiObject], Sequence[KittiObject]]],
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Overlaps from above and in 3D, (labels, detections) a frame: one compiled call for all frames."""
+    rows_a, rows_b, shapes = [np.zeros((0, 7))], [np.zeros((0, 7))], []
+    for labels, detections in pairs:
+        shapes.append((len(labels), len(detections)))
+        rows_a.append(np.repeat(camera_boxes(labels), len(detections), axis=0))
+        rows_b.append(np.tile(camera_boxes(detections), (len(labels), 1)))
+    bev, box = paired_overlaps(np.concatenate(rows_a), np.concatenate(rows_b))
+    ends = np.cumsum([rows * columns for rows, columns in shapes], dtype=int)[:-1]
+    parts = zip(np.split(bev, ends), np.split(box, ends), shapes, strict=False)
+    return [(b.reshape(shape), v.reshape(shape)) for b, v, shape in parts]
+
+
+def _build_frame(
+    labels: Sequence[KittiObject], detections: Sequence[KittiObject], bev: np.ndarray, box: np.ndarray
+) -> _Frame:
+    image = image_iou(_image_boxes(labels), _image_boxes(detections))
+    regions = _image_boxes([label for label in labels if label.is_dont_care])
+    excused = image_fractions(_image_boxes(detections), regions).max(axis=1, initial=0)
+    scores = np.array([item.score for item in detections], float)
+    overlaps = {"image": image, "orientation": image, "bev": bev, "3d": box}
+    return _Frame(labels, detections, scores, overlaps, excused)
+
+
+def _image_boxes(objects: Sequence[KittiObject]) -> np.ndarray:
+    return np.array([item.box_px for item in objects], float).reshape(-1, 4)
+
+
+def _curves(
+    frames: Sequence[_Frame], min_overlap: Mapping[str, float], metrics: Sequence[str]
+) -> tuple[PrecisionCurve, ...]:
+    return tuple(
+        _curve(frames, class_name, metric, level, overlap)
+        for class_name, overlap in min_overlap.items()
+        for metric in metrics
+        for level in range(len(DIFFICULTIES))
+    )
+
+
+def _curve(
+    frames: Sequence[_Frame], class_name: str, metric: str, level: int, min_overlap: float
+) -> PrecisionCurve:
+    """One precision curve: collects the thresholds, then counts right and wrong at each of them."""
+    rounds = [_Round.of(frame, class_name, metric, level, min_overlap) for frame in frames]
+    num_labels = sum(int(np.sum(r.label_roles == _COUNTS)) for r in rounds)
+    scores = np.concatenate([np.zeros(0), *(_matched_scores(r) for r in rounds)])
+    thresholds = _recall_thresholds(scores, num_labels)
+    counts = np.zeros((3, len(thresholds)))
+    for r in rounds:
+        counts += _count(r, thresholds)
+    right, wrong, similarity = counts
+    gain = similarity if metric == "orientation" else right
+    if metric == "orientation" and any(d.alpha == _INVALID_ALPHA for f in frames for d in f.detections):
+        gain = np.zeros_like(gain)
+    total = right + wrong
+    precision = _pad(np.divide(gain, total, out=np.zeros_like(total), where=total > 0))
+    best_onward = np.maximum.accumulate(precision[::-1])[::-1]
+    ceiling = _pad(np.ones(len(_recall_thresholds(np.ones(num_labels), num_labels))))
+    return PrecisionCurve(class_name, metric, DIFFICULTIES[level], best_onward, num_labels, ceiling)
+
+
+def _pad(values: np.ndarray) -> np.ndarray:
+    return np.concatenate([values, np.zeros(NUM_SAMPLES)])[:NUM_SAMPLES]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Round:
+    """One frame as one class, metric and difficulty sees it."""
+
+    label_roles: np.ndarray
+    detection_roles: np.ndarray
+    scores: np.ndarray
+    overlap: np.ndarray
+    """(labels, detections)."""
+    candidate: np.ndarray
+    """(labels, detections) bool: overlap enough, and neither is of another class."""
+    excused: np.ndarray
+    """(detections,) bool: covered by a DontCare region."""
+    similarity: np.ndarray
+    """(labels, detections) orientation similarity, (1 + cos of the difference of alpha) / 2."""
+
+    @classmethod
+    def of(cls, frame: _Frame, class_name: str, metric: str, level: int, min_overlap: float) -> "_Round":
+        roles = label_roles(frame.labels, class_name, level)
+        detection_roles = np.array([_detection_role(d, class_name, level) for d in frame.detections], int)
+        overlap = frame.overlaps[metric]
+        used = (roles != _OTHER)[:, None] & (detection_roles != _OTHER)
+        label_alpha = np.array([label.alpha for label in frame.labels], float)
+        alpha = np.array([detection.alpha for detection in frame.detections], float)
+        in_image = metric in ("image", "orientation")
+        return cls(
+            label_roles=roles,
+            detection_roles=detection_roles,
+            scores=frame.scores,
+            overlap=overlap,
+            candidate=(overlap > min_overlap) & used,
+            excused=(frame.excused > min_overlap) & in_image,
+            similarity=(1 + np.cos(label_alpha[:, None] - alpha)) / 2,
+        )
+
+
+def _matched_scores(r: _Round) -> np.ndarray:
+    """Scores of the true positives where each label, in order, takes its best-scored candidate."""
+    free = np.ones(len(r.scores), bool)
+    scores = []
+    for label in np.flatnonzero(r.candidate.any(axis=1)):
+        available = r.candidate[label] & free
+        if not available.any():
+            continue
+        chosen = int(np.argmax(np.where(available, r.scores, -np.inf)))
+        free[chosen] = False
+        if r.label_roles[label] == _COUNTS and r.detection_roles[chosen] == _COUNTS:
+            scores.append(r.scores[chosen])
+    return np.array(scores, float)
+
+
+def _recall_thresholds(scores: np.ndarray, num_labels: int) -> np.ndarray:
+    """Scores at which recall comes closest to each of its samples, at most 41, descending."""
+    scores = np.sort(scores)[::-1]
+    thresholds, recall = [], 0.0
+    for i, score in enumerate(scores):
+        here, following = (i + 1) / num_labels, (i + 2) / num_labels
+        # The next score comes closer to this sample of recall; the last one is always taken.
+        if i < len(scores) - 1 and following - recall < recall - here:
+            continue
+        thresholds.append(score)
+        recall += 1 / (NUM_SAMPLES - 1)
+    return np.array(thresholds[:NUM_SAMPLES], float)
+
+
+def _count(r: _Round, thresholds: np.ndarray) -> np.ndarray:
+    """Counts one frame at every threshold T: each label, in order, takes its best-overlapping candidate.
+
+    Candidates of the class come before those that are ignored, of which the first is taken.
+
+    Returns:
+      (3, T): right detections, wrong ones, and summed orientation similarity of the right ones.
+    """
+    free = r.scores >= thresholds[:, None]
+    right, similarity = np.zeros(len(thresholds)), np.zeros(len(thresholds))
+    counts = r.detection_roles == _COUNTS
+    for label in np.flatnonzero(r.candidate.any(axis=1)):
+        available = free & r.candidate[label]
+        proper = available & counts
+        best = np.argmax(np.where(proper, r.overlap[label], -1), axis=1)
+        chosen = np.where(proper.any(axis=1), best, np.argmax(available, axis=1))
+        matched = np.flatnonzero(available.any(axis=1))
+        free[matched, chosen[matched]] = False
+        if r.label_roles[label] == _COUNTS:
+            hit = matched[counts[chosen[matched]]]
+            right[hit] += 1
+            similarity[hit] += r.similarity[label, chosen[hit]]
+    return np.stack([right, (free & counts & ~r.excused).sum(axis=1), similarity])
