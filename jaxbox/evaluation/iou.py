@@ -1,5 +1,7 @@
 """Overlap of boxes: in the bird's-eye view, in 3D, in the image, and of single dimensions."""
 
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -68,7 +70,7 @@ def paired_overlaps(boxes_a: np.ndarray, boxes_b: np.ndarray) -> tuple[np.ndarra
     padded[0, :num_pairs] = boxes_a
     padded[0, :num_pairs, :3] = boxes_a[:, :3] - boxes_b[:, :3]
     padded[1, :num_pairs, 3:] = boxes_b[:, 3:]
-    bev, box = _batched_overlaps(padded[0], padded[1])
+    bev, box = _batched_overlaps(jnp.asarray(padded[0]), jnp.asarray(padded[1]))
     return np.asarray(bev, float)[:num_pairs], np.asarray(box, float)[:num_pairs]
 
 
@@ -82,11 +84,29 @@ def pairwise_overlaps(boxes_a: np.ndarray, boxes_b: np.ndarray) -> tuple[np.ndar
     Returns:
       Bird's-eye IoU and 3D IoU, each (A, B) float64 in [0, 1].
     """
-    shape = len(boxes_a), len(boxes_b)
-    rows_a = np.repeat(np.reshape(boxes_a, (-1, 7)), shape[1], axis=0)
-    rows_b = np.tile(np.reshape(boxes_b, (-1, 7)), (shape[0], 1))
+    return framewise_overlaps([(boxes_a, boxes_b)])[0]
+
+
+def framewise_overlaps(
+    frames: Sequence[tuple[np.ndarray, np.ndarray]],
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Overlaps of every first box with every second box of the same frame, in one compiled call.
+
+    Args:
+      frames: for each frame, boxes (A, 7) and (B, 7) as for `pairwise_overlaps`.
+
+    Returns:
+      For each frame, the bird's-eye IoU and the 3D IoU, each (A, B) float64 in [0, 1].
+    """
+    shapes = [(len(a), len(b)) for a, b in frames]
+    empty = np.zeros((0, 7))
+    rows_a = np.concatenate([empty, *(np.repeat(np.reshape(a, (-1, 7)), len(b), axis=0) for a, b in frames)])
+    rows_b = np.concatenate([empty, *(np.tile(np.reshape(b, (-1, 7)), (len(a), 1)) for a, b in frames)])
     bev, box = paired_overlaps(rows_a, rows_b)
-    return bev.reshape(shape), box.reshape(shape)
+    ends = np.cumsum([rows * columns for rows, columns in shapes], dtype=int)[:-1]
+    # Splitting nothing still gives one part; without frames there is none to give.
+    parts = zip(shapes, np.split(bev, ends), np.split(box, ends), strict=False)
+    return [(b.reshape(shape), v.reshape(shape)) for shape, b, v in parts]
 
 
 def image_intersections(boxes_a: np.ndarray, boxes_b: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxbox.evaluation.iou import image_fractions, image_iou, paired_overlaps
+from jaxbox.evaluation.iou import framewise_overlaps, image_fractions, image_iou
 from jaxbox.io import KittiObject
 
 DIFFICULTIES = ("easy", "moderate", "hard")
@@ -273,23 +273,8 @@ def _build_frames(labels: Objects, results: Objects) -> list[_Frame]:
     for name in labels:
         if any(item.score is None for item in results[name]):
             raise ValueError(f"frame {name} has a detection without score; results need 16 columns.")
-    spatial = _spatial_overlaps(pairs)
+    spatial = framewise_overlaps([(camera_boxes(a), camera_boxes(b)) for a, b in pairs])
     return [_build_frame(*pair, *overlaps) for pair, overlaps in zip(pairs, spatial, strict=True)]
-
-
-def _spatial_overlaps(
-    pairs: Sequence[tuple[Sequence[KittiObject], Sequence[KittiObject]]],
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Overlaps from above and in 3D, (labels, detections) a frame: one compiled call for all frames."""
-    rows_a, rows_b, shapes = [np.zeros((0, 7))], [np.zeros((0, 7))], []
-    for labels, detections in pairs:
-        shapes.append((len(labels), len(detections)))
-        rows_a.append(np.repeat(camera_boxes(labels), len(detections), axis=0))
-        rows_b.append(np.tile(camera_boxes(detections), (len(labels), 1)))
-    bev, box = paired_overlaps(np.concatenate(rows_a), np.concatenate(rows_b))
-    ends = np.cumsum([rows * columns for rows, columns in shapes], dtype=int)[:-1]
-    parts = zip(np.split(bev, ends), np.split(box, ends), shapes, strict=False)
-    return [(b.reshape(shape), v.reshape(shape)) for b, v, shape in parts]
 
 
 def _build_frame(
