@@ -1,6 +1,7 @@
 """jaxbox: training-free LiDAR vehicle detection as one compiled JAX function."""
 
 from jaxbox.config import DetectorConfig
+from jaxbox.detector import detect
 from jaxbox.types import Calibration, Detections, GroundPlane, Hulls, Label, PointCloud, Status, stack_clouds
 from jaxbox.version import __version__
 
@@ -14,5 +15,6 @@ __all__ = [
     "PointCloud",
     "Status",
     "__version__",
+    "detect",
     "stack_clouds",
 ]

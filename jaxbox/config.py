@@ -205,6 +205,8 @@ class BoxConfig:
     distances to the edges, the points closest to the edges, or to the two edges facing the sensor."""
     num_angles: int = _static(90)
     """static: A, rotations tried over 90 degrees."""
+    fit_to: Literal["slab", "hull"] = _static("slab")
+    """static: fit to points of the cluster between two heights, or to its convex hull (the paper)."""
     max_points: int = _static(128)
     """static: M, points of a cluster that the rectangle is fitted to, spread evenly over it."""
     max_slab_points: int | None = _static(None)
@@ -316,7 +318,7 @@ class VehicleConfig:
     """Priors of car, van and truck."""
     large_height_m: Scalar = 1.7
     """Clusters higher than this are also tried as a van or a truck."""
-    max_large: int = _static(256)
+    max_large: int = _static(512)
     """static: capacity for clusters also tried as a van or a truck."""
     max_candidates: int = _static(512)
     """static: capacity for boxes that pass the gates, before suppression."""
@@ -384,7 +386,7 @@ class DetectorConfig:
                 maps=(ComponentMap(cell_m=0.35, num_levels=8, max_cells=24576),), adaptive_growth=0.0
             ),
             evidence=EvidenceConfig(enabled=False),
-            box=BoxConfig(criterion="area", scene_direction=False, slab_min_height_m=0.0, slab_max_height_m=4.0),
+            box=BoxConfig(criterion="area", fit_to="hull", scene_direction=False),
             completion=CompletionConfig(mode="none"),
         )
 

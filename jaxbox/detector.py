@@ -1,0 +1,52 @@
+"""detect(): from a sweep to vehicle boxes, as one compiled function. Wiring only."""
+
+import jax
+
+from jaxbox import steps
+from jaxbox.config import DetectorConfig
+from jaxbox.types import Detections, PointCloud
+
+
+def detect(
+    cloud: PointCloud, config: DetectorConfig | None = None, key: jax.Array | None = None
+) -> Detections:
+    """Finds the vehicles of one sweep.
+
+    One jitted function of fixed shape: it compiles once for each capacity and set of static settings, and
+    never again when sweeps change length or thresholds move. `jax.vmap` it over a batch of clouds, of
+    configurations or of keys: the batch gives the singles' answers.
+
+    Args:
+      cloud: one sweep, see `PointCloud.from_numpy`.
+      config: the settings; None for the default preset.
+      key: JAX random key for RANSAC; None for `jax.random.key(0)`. The same key gives the same bits.
+
+    Returns:
+      The detections, best score first. Whatever was dropped is in `status` and `counts`.
+
+    Reference: paper, section 3; oracle `jaxbox.reference.detect`.
+    """
+    config = DetectorConfig() if config is None else config
+    key = jax.random.key(0) if key is None else key
+    return _detect_jit(cloud, config, key)
+
+
+# A batch runs its sweeps one after the other: on a CPU, batched scatters, and loops that end with the
+# largest sweep of the batch, cost more than they save; and each answer has the bits of its single.
+@jax.jit
+@jax.custom_batching.sequential_vmap
+def _detect_jit(cloud: PointCloud, config: DetectorConfig, key: jax.Array) -> Detections:
+    # 3.1 Statistical filtering, and ground removal by RANSAC (Algorithm I).
+    sweep = steps.select_points(cloud, config)
+    heights = steps.remove_ground(sweep, config, key)
+    obstacles = steps.gather_obstacles(sweep, heights, config)
+    # 3.2 Segmentation by 3D grid subdivision (Algorithm II): several maps, several proposals.
+    proposals = steps.propose_clusters(obstacles, config)
+    # 3.3, 3.4 Convex hull and minimum rectangle over all rotations (Algorithm III).
+    fits = steps.fit_rectangles(obstacles, proposals, config)
+    # Correction for occluded objects: what the beams saw decides how each box goes on out of sight.
+    seen = steps.build_evidence(sweep, heights, config)
+    trials, boxes = steps.complete_boxes(fits, proposals, seen, config)
+    # Vehicle decision: score, suppression, and (3.5) the descriptors of what is left.
+    candidates = steps.score_boxes(trials, boxes, proposals, obstacles, heights, seen, config)
+    return steps.conclude(cloud, sweep, heights, obstacles, proposals, candidates, config)
