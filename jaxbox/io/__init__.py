@@ -1,6 +1,41 @@
-"""Files in and out: KITTI's formats and folder layouts, plain points, JSON Lines."""
+"""Files in and out: KITTI's formats and folder layouts, plain points, images, JSON Lines."""
 
-from jaxbox.io._files import InputError
-from jaxbox.io.kitti import KittiObject, read_label_folder, read_labels, write_labels
+from jaxbox.io._files import InputError, atomic_path, atomic_writer
+from jaxbox.io.images import read_image
+from jaxbox.io.jsonl import detections_record, read_jsonl, write_jsonl
+from jaxbox.io.kitti import (
+    KittiObject,
+    boxes_from_objects,
+    objects_from_detections,
+    read_calibration,
+    read_label_folder,
+    read_labels,
+    read_raw_calibration,
+    write_labels,
+)
+from jaxbox.io.points import read_bin, read_points, read_text_points, write_bin
+from jaxbox.io.sweeps import Sweep, open_sweeps
 
-__all__ = ["InputError", "KittiObject", "read_label_folder", "read_labels", "write_labels"]
+__all__ = [
+    "InputError",
+    "KittiObject",
+    "Sweep",
+    "atomic_path",
+    "atomic_writer",
+    "boxes_from_objects",
+    "detections_record",
+    "objects_from_detections",
+    "open_sweeps",
+    "read_bin",
+    "read_calibration",
+    "read_image",
+    "read_jsonl",
+    "read_label_folder",
+    "read_labels",
+    "read_points",
+    "read_raw_calibration",
+    "read_text_points",
+    "write_bin",
+    "write_jsonl",
+    "write_labels",
+]

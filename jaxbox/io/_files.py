@@ -51,8 +51,8 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
 
 
 @contextlib.contextmanager
-def atomic_writer(path: str | os.PathLike[str]) -> Iterator[TextIO]:
-    """Opens a text file that takes its name only once it is whole.
+def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
+    """Lends a temporary file that takes its name only once the block has ended well.
 
     A crash or an error within the block leaves whatever stood at `path` as it was. The temporary file
     lies in the same folder, because a rename is atomic only within one file system.
@@ -61,20 +61,35 @@ def atomic_writer(path: str | os.PathLike[str]) -> Iterator[TextIO]:
       path: the file; its folder is made where it is missing.
 
     Yields:
-      A UTF-8 text handle.
+      Path of an empty file with the same suffix, to be written by any means.
     """
     target = pathlib.Path(path)
     target.parent.mkdir(parents=True, exist_ok=True)
-    descriptor, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".tmp")
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.stem}.", suffix=target.suffix)
+    os.close(handle)
+    temporary = pathlib.Path(name)
     try:
-        with os.fdopen(descriptor, "w", encoding="utf-8", newline="\n") as handle:
-            yield handle
+        yield temporary
         # mkstemp makes the file private; a result is to be as readable as any other new file.
-        os.chmod(temporary, _default_mode())
-        os.replace(temporary, target)
+        temporary.chmod(_default_mode())
+        temporary.replace(target)
     except BaseException:
-        pathlib.Path(temporary).unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
         raise
+
+
+@contextlib.contextmanager
+def atomic_writer(path: str | os.PathLike[str]) -> Iterator[TextIO]:
+    """Opens a text file that takes its name only once it is whole; see `atomic_path`.
+
+    Args:
+      path: the file; its folder is made where it is missing.
+
+    Yields:
+      A UTF-8 text handle.
+    """
+    with atomic_path(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as handle:
+        yield handle
 
 
 def _default_mode() -> int:
