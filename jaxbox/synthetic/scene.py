@@ -5,7 +5,7 @@ import enum
 
 import numpy as np
 
-from jaxbox.synthetic.solids import Foliage, Material, Shape, Solid, make_post, make_solid, vehicle_solids
+from jaxbox.synthetic.solids import Foliage, Material, Shape, make_post, make_solid, vehicle_solids
 from jaxbox.synthetic.terrain import GroundKind, Road, Terrain, make_terrain
 from jaxbox.types import Label
 
@@ -13,7 +13,7 @@ MIN_RANGE_M, MAX_RANGE_M = 5.0, 55.0
 """Vehicles stand at these ranges: nearer they hide the scene, beyond they hold few points."""
 SPACING_M = 0.6
 """Least gap between two things that stand on the ground."""
-MAX_TRIES = 4000
+MAX_TRIES = 1500
 """Placements tried before the street counts as full."""
 SIZE_QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 CAR_SIZE_M = (
@@ -38,7 +38,7 @@ PAINTS = (
     (0.75, 0.75, 0.76),
     (0.1, 0.1, 0.11),
     (0.5, 0.52, 0.54),
-    (0.55, 0.08, 0.08),
+    (0.5, 0.03, 0.03),
     (0.1, 0.17, 0.4),
     (0.3, 0.3, 0.3),
 )
@@ -184,15 +184,20 @@ def _draw_vehicles(rng: np.random.Generator, road: Road, count: int) -> tuple[Ve
         if len(vehicles) == count:
             break
         vehicle = _draw_vehicle(rng, road)
-        may_hide = rng.random() < HIDDEN_SHARE
-        in_reach = MIN_RANGE_M <= np.hypot(*vehicle.xy) <= MAX_RANGE_M
-        apart = all(_apart(outline(vehicle), outline(other)) for other in vehicles)
-        clear = may_hide or not any(_hides(vehicle, other) or _hides(other, vehicle) for other in vehicles)
-        if in_reach and apart and clear:
+        if _has_room(vehicle, vehicles, may_hide=rng.random() < HIDDEN_SHARE):
             vehicles.append(vehicle)
     if len(vehicles) < count:
         raise ValueError(f"num_vehicles is {count}, but only {len(vehicles)} found room on this street.")
     return tuple(vehicles)
+
+
+def _has_room(vehicle: Vehicle, others: list[Vehicle], *, may_hide: bool) -> bool:
+    """Whether a vehicle is in reach, apart from all others, and, unless it may, hides none of them."""
+    if not MIN_RANGE_M <= np.hypot(*vehicle.xy) <= MAX_RANGE_M:
+        return False
+    if not all(_apart(outline(vehicle), outline(other)) for other in others):
+        return False
+    return may_hide or not any(_hides(vehicle, other) or _hides(other, vehicle) for other in others)
 
 
 def _draw_vehicle(rng: np.random.Generator, road: Road) -> Vehicle:
@@ -354,8 +359,8 @@ def _kerbside(
         return Thing(
             int(Clutter.POLE), (make_post(foot, rng.uniform(0.06, 0.12), rng.uniform(3, 7)),)
         ), footprint
-    trunk: Solid = make_post(foot, rng.uniform(0.12, 0.22), 3.5)
+    trunk = make_post(foot, rng.uniform(0.12, 0.22), 4.2)
     crown = tuple(
-        Foliage(foot + rng.normal((0, 0, 4.6), (0.8, 0.8, 0.6)), rng.uniform(0.7, 1.5, 3)) for _ in range(6)
+        Foliage(foot + rng.normal((0, 0, 4.6), (0.6, 0.6, 0.4)), rng.uniform(0.8, 1.5, 3)) for _ in range(7)
     )
     return Thing(int(Clutter.BUSH), (trunk, *crown)), footprint
