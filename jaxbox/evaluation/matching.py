@@ -31,7 +31,7 @@ _EXCUSED_FRACTION = 0.5
 
 @dataclasses.dataclass(frozen=True)
 class Selection:
-    """Which labels count, and which detections are asked."""
+    """Which labels count, and of which class the detections are."""
 
     class_name: str = "Car"
     """Class of both."""
@@ -43,8 +43,6 @@ class Selection:
     """KITTI's limits that a label must keep: "easy", "moderate", "hard", or None for none."""
     track_id: int | None = None
     """Only this object of a tracking sequence, or None for every one."""
-    min_score: float | None = None
-    """Score that a detection must reach, or None for every one."""
 
     def __post_init__(self):
         if self.difficulty not in (None, *kitti.DIFFICULTIES):
@@ -69,6 +67,8 @@ class Scene:
     """(A,) int: LiDAR points within the label's box, -1 where unknown."""
     detections: np.ndarray
     """(B, 7) float64, likewise."""
+    scores: np.ndarray
+    """(B,) float64, higher is better."""
     excused: np.ndarray
     """(B,) bool: neither right nor wrong unless it matches a label."""
     bev: np.ndarray
@@ -97,26 +97,30 @@ def select(
       One scene a frame, in the order of the labels.
 
     Raises:
-      ValueError: for a selection by points or by score where these are unknown.
+      ValueError: for a selection by points where they are unknown, or a detection without score.
     """
     if num_points is None and selection.min_points > 0:
         raise ValueError("labels are selected by their LiDAR points, but no sweeps were given to count them.")
-    parts = []
+    found = {name: _detections_of(results[name], selection.class_name, name) for name in labels}
+    boxes = {name: kitti.camera_boxes(items) for name, items in found.items()}
+    scenes = []
     for name, objects in labels.items():
         roles = np.array([_label_role(item, selection) for item in objects], int)
         points = np.full(len(objects), -1) if num_points is None else np.asarray(num_points[name], int)
-        roles[(roles == _COUNTS) & (points < selection.min_points) & (points >= 0)] = _IGNORED
-        asked = [item for item in results[name] if _is_asked(item, selection)]
-        kept = np.flatnonzero(roles != _OTHER)
-        boxes = kitti.camera_boxes(objects)[kept]
-        parts.append((name, boxes, roles[kept] == _COUNTS, points[kept], asked, _excused(asked, objects)))
-    detected = [kitti.camera_boxes(asked) for *_, asked, _ in parts]
-    overlaps = framewise_overlaps([(part[1], boxes) for part, boxes in zip(parts, detected, strict=True)])
+        roles[(roles == _COUNTS) & (points >= 0) & (points < selection.min_points)] = _IGNORED
+        rows = np.flatnonzero(roles != _OTHER)
+        scenes.append((name, kitti.camera_boxes(objects)[rows], roles[rows] == _COUNTS, points[rows]))
+    overlaps = framewise_overlaps([(scene[1], boxes[scene[0]]) for scene in scenes])
     return [
-        Scene(name, boxes, counts, points, found, excused, *overlap)
-        for (name, boxes, counts, points, _, excused), found, overlap in zip(
-            parts, detected, overlaps, strict=True
+        Scene(
+            *scene,
+            detections=boxes[scene[0]],
+            scores=np.array([item.score for item in found[scene[0]]], float),
+            excused=_excused(found[scene[0]], labels[scene[0]]),
+            bev=bev,
+            box=box,
         )
+        for scene, (bev, box) in zip(scenes, overlaps, strict=True)
     ]
 
 
@@ -139,14 +143,11 @@ def _label_role(label: KittiObject, selection: Selection) -> int:
     return int(kitti.label_roles([label], class_name, level)[0])
 
 
-def _is_asked(detection: KittiObject, selection: Selection) -> bool:
-    if detection.type.lower() != selection.class_name.lower():
-        return False
-    if selection.min_score is None:
-        return True
-    if detection.score is None:
-        raise ValueError("a detection has no score to select by; results need 16 columns.")
-    return detection.score >= selection.min_score
+def _detections_of(results: Sequence[KittiObject], class_name: str, frame: str) -> list[KittiObject]:
+    found = [item for item in results if item.type.lower() == class_name.lower()]
+    if any(item.score is None for item in found):
+        raise ValueError(f"frame {frame} has a detection without score; results need 16 columns.")
+    return found
 
 
 def _excused(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -> np.ndarray:
@@ -154,6 +155,30 @@ def _excused(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -
     regions = np.array([item.box_px for item in labels if item.is_dont_care], float).reshape(-1, 4)
     covered = image_fractions(boxes, regions).max(axis=1, initial=0)
     return (boxes[:, 3] - boxes[:, 1] < _MIN_HEIGHT_PX) | (covered > _EXCUSED_FRACTION)
+
+
+def cut(scenes: Sequence[Scene], *, min_score: float) -> list[Scene]:
+    """Leaves out detections below a score.
+
+    Args:
+      scenes: the frames.
+      min_score: score that a detection must reach.
+
+    Returns:
+      The same frames and labels, with the other detections.
+    """
+    return [_take_detections(scene, scene.scores >= min_score) for scene in scenes]
+
+
+def _take_detections(scene: Scene, keep: np.ndarray) -> Scene:
+    return dataclasses.replace(
+        scene,
+        detections=scene.detections[keep],
+        scores=scene.scores[keep],
+        excused=scene.excused[keep],
+        bev=scene.bev[:, keep],
+        box=scene.box[:, keep],
+    )
 
 
 def match(overlap: np.ndarray, counts: np.ndarray, *, min_overlap: float) -> np.ndarray:
