@@ -54,7 +54,8 @@ def complete_extent(low: float, high: float, prior_m: float, keep: int) -> tuple
     length = max(prior_m, high - low)
     if keep == KEEP_CENTRE:
         return (low + high) / 2, length
-    if (keep == KEEP_NEAR) == (abs(low) < abs(high)):
+    # The nearer end is the lower one where the middle is positive, also for an interval of no length.
+    if (keep == KEEP_NEAR) == (low + high > 0):
         return low + length / 2, length
     return high - length / 2, length
 

@@ -4,20 +4,11 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
 
-from jaxbox.config import ClassPrior, ComponentMap, DetectorConfig
-from jaxbox.reference.boxes import (
-    ShapeDescriptors,
-    convex_hull,
-    criterion_curve,
-    fit_points,
-    shape_descriptors,
-    wrap_yaw,
-)
-from jaxbox.reference.clusters import NO_CLUSTER, grid_cells, keep_clusters, label_components, warp_range
-from jaxbox.reference.completion import CompletedBox, complete_box, direction_preference, scene_direction
-from jaxbox.reference.evidence import Evidence, box_evidence, build_evidence, support_at
+from jaxbox.config import DetectorConfig
+from jaxbox.reference.boxes import ShapeDescriptors, convex_hull, shape_descriptors, wrap_yaw
+from jaxbox.reference.clusters import NO_CLUSTER
+from jaxbox.reference.evidence import Evidence, build_evidence
 from jaxbox.reference.filtering import filter_outliers, select_points
 from jaxbox.reference.ground import (
     cell_minima,
@@ -27,14 +18,16 @@ from jaxbox.reference.ground import (
     height_above_ground,
     spread_candidates,
 )
-from jaxbox.reference.vehicles import (
-    PointsAround,
-    count_points_around,
-    distance_outside,
-    score_box,
-    suppress,
+from jaxbox.reference.proposals import (
+    Candidate,
+    Obstacles,
+    find_clusters,
+    index_obstacles,
+    judge_candidates,
+    make_proposals,
+    select_options,
 )
-from jaxbox.types import Label
+from jaxbox.reference.vehicles import distance_outside, suppress
 
 INSIDE_SLACK_M = 1e-3
 """A detection's points may lie this far outside its box: the box goes through the outermost of them."""
@@ -86,32 +79,6 @@ class _Ground:
     grid: np.ndarray | None
 
 
-@dataclasses.dataclass(frozen=True)
-class _Obstacles:
-    rows: np.ndarray
-    xyz: np.ndarray
-    height: np.ndarray
-    tree: KDTree | None
-
-
-@dataclasses.dataclass(frozen=True)
-class _Proposal:
-    members: np.ndarray
-    xy: np.ndarray
-    curve: np.ndarray
-    extents: np.ndarray
-    top_m: float
-
-
-@dataclasses.dataclass(frozen=True)
-class _Candidate:
-    proposal: _Proposal
-    completed: CompletedBox
-    around: PointsAround
-    label: Label
-    score: float
-
-
 def detect(xyz: np.ndarray, config: DetectorConfig | None = None, seed: int = 0) -> ReferenceDetections:
     """Detects vehicles in one sweep: the oracle and the baseline of `jaxbox.detect`.
 
@@ -138,19 +105,20 @@ def detect(xyz: np.ndarray, config: DetectorConfig | None = None, seed: int = 0)
     ground = _fit_ground(xyz, inlier, settings, np.random.default_rng(seed))
     height = np.full(len(xyz), np.nan)
     height[inlier] = _height(xyz[inlier], ground, settings)
-    is_ground = inlier & (np.nan_to_num(height, nan=np.inf) <= settings.ground.min_height_m)
-    is_overhead = inlier & (np.nan_to_num(height, nan=-np.inf) >= settings.ground.max_height_m)
+    # NaN, the height of points that are left out, is on no side.
+    is_ground = height <= settings.ground.min_height_m
+    is_overhead = height >= settings.ground.max_height_m
     obstacle_rows = np.flatnonzero(inlier & ~is_ground & ~is_overhead)
-    obstacles = _obstacles(xyz, height, obstacle_rows[: settings.clustering.max_obstacles])
+    obstacles = index_obstacles(xyz, height, obstacle_rows[: settings.clustering.max_obstacles])
 
-    maps = [_clusters(obstacles, component_map, settings) for component_map in settings.clustering.maps]
-    proposals = [_proposals(obstacles, slot, settings) for _, slot, _ in maps]
+    maps = [find_clusters(obstacles, component_map, settings) for component_map in settings.clustering.maps]
+    proposals = [make_proposals(obstacles, slot, settings) for _, slot, _ in maps]
     evidence = _evidence(xyz[inlier], height[inlier], ground, settings)
-    candidates = _candidates(proposals, obstacles, evidence, settings)
-    boxes = np.array([c.completed.box for c in candidates]).reshape(-1, 5)
-    scores = np.array([c.score for c in candidates])
+    candidates = judge_candidates(proposals, obstacles, evidence, settings)
+    best = candidates[: settings.vehicles.max_candidates]
+    boxes = np.array([candidate.completed.box for candidate in best]).reshape(-1, 5)
+    scores = np.array([candidate.score for candidate in best])
     rows = suppress(boxes, scores, max_overlap=settings.vehicles.max_overlap)
-    winners = [candidates[row] for row in rows[: settings.vehicles.max_detections]]
 
     counts = {
         "dropped_points": 0,
@@ -167,28 +135,18 @@ def detect(xyz: np.ndarray, config: DetectorConfig | None = None, seed: int = 0)
     }
     component = np.full(len(xyz), NO_CLUSTER)
     component[obstacles.rows] = maps[0][0]
-    return _assemble(
-        winners,
-        obstacles,
-        ground,
-        counts,
-        settings,
-        height=height,
-        ground_mask=is_ground,
-        component=component,
-    )
-
-
-def _options(config: Any, *names: str) -> dict[str, Any]:
-    """The named fields of a config as keyword arguments."""
-    return {name: getattr(config, name) for name in names}
+    winners = [best[row] for row in rows[: settings.vehicles.max_detections]]
+    points = {"height": height, "ground_mask": is_ground, "point_component": component}
+    return _assemble(winners, obstacles, ground, counts, settings=settings, points=points)
 
 
 def _filter(xyz: np.ndarray, valid: np.ndarray, settings: Any) -> np.ndarray:
     inlier = valid.copy()
     if settings.filtering.enabled:
         names = ("cell_m", "num_levels", "num_iterations", "bandwidth_m", "num_std", "min_density")
-        options = _options(settings.filtering, *names) | _options(settings.region, "half_x_m", "half_y_m")
+        options = select_options(settings.filtering, *names) | select_options(
+            settings.region, "half_x_m", "half_y_m"
+        )
         inlier[valid] = filter_outliers(xyz[valid], **options)
     return inlier
 
@@ -208,13 +166,15 @@ def _fit_ground(xyz: np.ndarray, inlier: np.ndarray, settings: Any, rng: np.rand
         "max_slope_deg",
         "min_inlier_fraction",
     )
-    fits = fit_ground_planes(candidates, rng=rng, **_options(ground, *names))
+    fits = fit_ground_planes(candidates, rng=rng, **select_options(ground, *names))
     planes = np.array([plane for plane, _, _ in fits])
     grid = None
     if ground.surface:
         names = ("num_envelope_rounds", "max_grade", "band_below_m", "band_below_grade", "band_above_m")
         names += ("band_above_grade", "blind_radius_m", "envelope_margin_m", "smoothing_m", "min_height_m")
-        grid = fit_ground_surface(xyz[inlier], planes, **_options(ground, *names), **_surface_grid(settings))
+        grid = fit_ground_surface(
+            xyz[inlier], planes, **select_options(ground, *names), **_surface_grid(settings)
+        )
     return _Ground(planes, fits[0][1], fits[0][2], grid)
 
 
@@ -223,39 +183,11 @@ def _surface_grid(settings: Any) -> dict[str, Any]:
 
 
 def _height(xyz: np.ndarray, ground: _Ground, settings: Any) -> np.ndarray:
-    options = _surface_grid(settings) | _options(settings.ground, "min_height_m")
+    options = _surface_grid(settings) | select_options(settings.ground, "min_height_m")
     return height_above_ground(xyz, ground.planes, ground.grid, **options)
 
 
-def _obstacles(xyz: np.ndarray, height: np.ndarray, rows: np.ndarray) -> _Obstacles:
-    tree = KDTree(xyz[rows, :2]) if len(rows) else None
-    return _Obstacles(rows, xyz[rows], height[rows], tree)
-
-
-def _clusters(
-    obstacles: _Obstacles, component_map: ComponentMap, settings: Any
-) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-    """Component and cluster of each obstacle in one map, and its numbers of cells and clusters."""
-    fields: Any = component_map
-    clustering = settings.clustering
-    member = (obstacles.height > fields.min_height_m) & (obstacles.height < fields.max_height_m)
-    xy = obstacles.xyz[member, :2]
-    cells, shape = grid_cells(
-        warp_range(xy, start_m=clustering.adaptive_start_m, growth=clustering.adaptive_growth),
-        obstacles.height[member],
-        **_options(settings.region, "half_x_m", "half_y_m"),
-        **_options(fields, "cell_m", "num_levels", "min_height_m"),
-    )
-    component = np.full(len(member), NO_CLUSTER)
-    slot = np.full(len(member), NO_CLUSTER)
-    component[member] = label_components(cells, shape)
-    gates = _options(clustering, "min_points", "max_extent_m")
-    slot[member], num_clusters = keep_clusters(xy, component[member], **gates)
-    slot[slot >= fields.max_clusters] = NO_CLUSTER
-    return component, slot, (len(np.unique(cells, axis=0)), num_clusters)
-
-
-def _cluster_counts(obstacles: _Obstacles, maps: list[Any], settings: Any) -> dict[str, Any]:
+def _cluster_counts(obstacles: Obstacles, maps: list[Any], settings: Any) -> dict[str, Any]:
     clustered = int(np.any([slot != NO_CLUSTER for _, slot, _ in maps], axis=0).sum())
     box, height = settings.box, obstacles.height
     return {
@@ -267,151 +199,18 @@ def _cluster_counts(obstacles: _Obstacles, maps: list[Any], settings: Any) -> di
     }
 
 
-def _proposals(obstacles: _Obstacles, slot: np.ndarray, settings: Any) -> list[_Proposal]:
-    """The clusters of one map, each with its rectangles at all rotations."""
-    box = settings.box
-    order = np.argsort(slot, kind="stable")
-    order = order[slot[order] != NO_CLUSTER]
-    starts = np.flatnonzero(np.diff(slot[order])) + 1
-    proposals = []
-    for members in np.split(order, starts) if len(order) else []:
-        chosen = fit_points(
-            members,
-            obstacles.height,
-            min_height_m=box.slab_min_height_m,
-            max_height_m=box.slab_max_height_m,
-            **_options(box, "min_slab_points", "max_points"),
-        )
-        xy = obstacles.xyz[chosen, :2]
-        curve, extents = criterion_curve(xy, **_options(box, "criterion", "num_angles", "min_distance_m"))
-        proposals.append(_Proposal(members, xy, curve, extents, float(obstacles.height[members].max())))
-    return proposals
-
-
 def _evidence(xyz: np.ndarray, height: np.ndarray, ground: _Ground, settings: Any) -> Evidence | None:
     if not settings.evidence.enabled:
         return None
     fields = {field.name for field in dataclasses.fields(settings.evidence)} - {"enabled"}
     sensor_height_m = -float(ground.planes[0, 2])
     return build_evidence(
-        xyz, height, sensor_height_m=sensor_height_m, **_options(settings.evidence, *fields)
+        xyz, height, sensor_height_m=sensor_height_m, **select_options(settings.evidence, *fields)
     )
-
-
-def _complete(
-    proposal: _Proposal, preference: np.ndarray, prior: ClassPrior, evidence: Evidence | None, settings: Any
-) -> CompletedBox | None:
-    value = proposal.curve + preference
-    best = int(np.argmax(value))
-    names = ("mode", "num_rays", "free_weight", "free_length_weight", "inside_weight", "near_weight")
-    names += ("closeness_weight", "not_away_cost")
-    return complete_box(
-        proposal.xy,
-        proposal.extents[best],
-        angle=best * np.pi / 2 / len(value),
-        criterion_value=float(value[best]),
-        evidence=evidence,
-        **_options(prior, "length_m", "width_m", "max_length_m", "max_width_m"),
-        **_options(settings.completion, *names),
-    )
-
-
-def _preference(proposals: list[_Proposal], evidence: Evidence | None, settings: Any) -> np.ndarray:
-    """The gain of each rotation from the direction that the first map's clusters share."""
-    box, car = settings.box, settings.vehicles.classes[Label.CAR]
-    none = np.zeros(box.num_angles)
-    fits = (
-        [(p, _complete(p, none, car, evidence, settings)) for p in proposals] if box.scene_direction else []
-    )
-    fits = [(p, fit) for p, fit in fits if fit is not None]
-    if not fits:
-        return none
-    boxes = np.array([fit.box for _, fit in fits])
-    rays = box_evidence(boxes, evidence, num_rays=settings.completion.num_final_rays)
-    direction = scene_direction(
-        boxes[:, 4],
-        np.array([max(fit.measured_length_m, fit.measured_width_m) for _, fit in fits]),
-        np.array([len(p.members) for p, _ in fits]),
-        rays.free_length,
-        num_angles=box.num_angles,
-        sigma_deg=box.direction_sigma_deg,
-        min_extent_m=box.direction_min_extent_m,
-        max_free=box.direction_max_free,
-    )
-    return direction_preference(
-        direction, num_angles=box.num_angles, weight=box.direction_weight, sigma_deg=box.direction_sigma_deg
-    )
-
-
-def _candidates(
-    proposals: list[list[_Proposal]], obstacles: _Obstacles, evidence: Evidence | None, settings: Any
-) -> list[_Candidate]:
-    """Every proposal as a car, the high ones as van and truck too: what scores, best first."""
-    vehicles = settings.vehicles
-    preference = _preference(proposals[0], evidence, settings)
-    every = [proposal for of_map in proposals for proposal in of_map]
-    large = [p for p in every if p.top_m > vehicles.large_height_m][: vehicles.max_large]
-    candidates = []
-    for label, chosen in ((Label.CAR, every), (Label.VAN, large), (Label.TRUCK, large)):
-        prior = vehicles.classes[label]
-        for proposal in chosen:
-            completed = _complete(proposal, preference, prior, evidence, settings)
-            if completed is not None:
-                judged = _judge(
-                    proposal, completed, label, obstacles=obstacles, evidence=evidence, settings=settings
-                )
-                candidates.append(judged)
-    candidates = [c for c in candidates if c.score > vehicles.min_score]
-    return sorted(candidates, key=lambda c: -c.score)[: vehicles.max_candidates]
-
-
-def _judge(
-    proposal: _Proposal,
-    completed: CompletedBox,
-    label: Label,
-    *,
-    obstacles: _Obstacles,
-    evidence: Evidence | None,
-    settings: Any,
-) -> _Candidate:
-    vehicles, box = settings.vehicles, completed.box
-    prior = vehicles.classes[label]
-    assert obstacles.tree is not None
-    near = obstacles.tree.query_ball_point(box[:2], np.hypot(box[2], box[3]) / 2 + 2 * vehicles.ring_m)
-    around = count_points_around(
-        box,
-        obstacles.xyz[near],
-        obstacles.height[near],
-        **_options(vehicles, "margin_m", "ring_m"),
-        **_options(settings.ground, "min_height_m", "max_height_m"),
-        count_max_height_m=prior.count_max_height_m,
-    )
-    rays = box_evidence(box[None], evidence, num_rays=settings.completion.num_final_rays)
-    names = (
-        "top_grade",
-        "min_extent_m",
-        "saturation_points",
-        "sparseness_power",
-        "free_scale",
-        "ring_weight",
-    )
-    names += ("overhead_weight", "support_points", "objective_gate", "objective_softness")
-    score = score_box(
-        box,
-        prior,
-        around=around,
-        **_options(completed, "objective", "measured_length_m", "measured_width_m"),
-        num_members=len(proposal.members),
-        hit=float(rays.hit[0]),
-        free_length=float(rays.free_length[0]),
-        support=None if evidence is None else support_at(box[:2], evidence),
-        **_options(vehicles, *names),
-    )
-    return _Candidate(proposal, completed, around, label, score)
 
 
 def _vertical(
-    candidate: _Candidate, obstacles: _Obstacles, ground: _Ground, settings: Any
+    candidate: Candidate, obstacles: Obstacles, ground: _Ground, settings: Any
 ) -> tuple[float, float]:
     """Middle and height of a box along z."""
     z = obstacles.xyz[candidate.proposal.members, 2]
@@ -422,30 +221,21 @@ def _vertical(
     height = max(candidate.around.top_m + vehicles.top_margin_m, prior.min_box_height_m)
     # z tells which of several planes the vehicle stands on.
     place = np.append(candidate.completed.box[:2], z.min())[None]
-    options = _surface_grid(settings) | _options(settings.ground, "min_height_m")
+    options = _surface_grid(settings) | select_options(settings.ground, "min_height_m")
     return ground_elevation(place, ground.planes, ground.grid, **options)[0] + height / 2, height
 
 
 def _assemble(
-    winners: list[_Candidate],
-    obstacles: _Obstacles,
+    winners: list[Candidate],
+    obstacles: Obstacles,
     ground: _Ground,
     counts: dict[str, Any],
-    settings: Any,
     *,
-    height: np.ndarray,
-    ground_mask: np.ndarray,
-    component: np.ndarray,
+    settings: Any,
+    points: dict[str, np.ndarray],
 ) -> ReferenceDetections:
-    point_detection = np.full(len(height), NO_CLUSTER)
-    own, hulls = [], []
-    for row, winner in enumerate(winners):
-        members = winner.proposal.members
-        inside = distance_outside(obstacles.xyz[members, :2], winner.completed.box) <= INSIDE_SLACK_M
-        free = point_detection[obstacles.rows[members]] == NO_CLUSTER
-        own.append(obstacles.xyz[members[inside & free], :2])
-        point_detection[obstacles.rows[members[inside & free]]] = row
-        hulls.append(convex_hull(own[-1]))
+    own, point_detection = _own_points(winners, obstacles, len(points["height"]))
+    hulls = tuple(convex_hull(xy) for xy in own)
     boxes = np.array([w.completed.box for w in winners]).reshape(-1, 5)
     vertical = np.array([_vertical(w, obstacles, ground, settings) for w in winners]).reshape(-1, 2)
     return ReferenceDetections(
@@ -455,14 +245,27 @@ def _assemble(
         score=np.array([w.score for w in winners]),
         label=np.array([w.label for w in winners], int),
         num_points=np.array([len(xy) for xy in own], int),
-        hulls=tuple(hulls),
+        hulls=hulls,
         descriptors=tuple(shape_descriptors(xy, hull) for xy, hull in zip(own, hulls, strict=True)),
         coefficients=ground.planes[0],
         found=ground.found,
         num_inliers=ground.num_inliers,
-        height=height,
-        ground_mask=ground_mask,
-        point_component=component,
         point_detection=point_detection,
         counts=counts | {"hull_vertices": max((len(hull) for hull in hulls), default=0)},
+        **points,
     )
+
+
+def _own_points(
+    winners: list[Candidate], obstacles: Obstacles, num_points: int
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """x, y of the points of each box, and the box of each point of the sweep; the better box has it."""
+    own, point_detection = [], np.full(num_points, NO_CLUSTER)
+    for row, winner in enumerate(winners):
+        members = winner.proposal.members
+        inside = distance_outside(obstacles.xyz[members, :2], winner.completed.box) <= INSIDE_SLACK_M
+        unclaimed = point_detection[obstacles.rows[members]] == NO_CLUSTER
+        claimed = members[inside & unclaimed]
+        point_detection[obstacles.rows[claimed]] = row
+        own.append(obstacles.xyz[claimed, :2])
+    return own, point_detection

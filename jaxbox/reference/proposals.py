@@ -1,0 +1,271 @@
+"""From obstacle points to scored boxes: every cluster of every map as every class that it may be."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from jaxbox.config import ClassPrior, ComponentMap
+from jaxbox.reference.boxes import criterion_curve, fit_points
+from jaxbox.reference.clusters import NO_CLUSTER, grid_cells, keep_clusters, label_components, warp_range
+from jaxbox.reference.completion import CompletedBox, complete_box, direction_preference, scene_direction
+from jaxbox.reference.evidence import Evidence, box_evidence, support_at
+from jaxbox.reference.vehicles import PointsAround, count_points_around, score_box
+from jaxbox.types import Label
+
+
+@dataclasses.dataclass(frozen=True)
+class Obstacles:
+    """The m points above the ground that are looked at, in sweep order."""
+
+    rows: np.ndarray
+    """(m,) int: their rows in the sweep."""
+    xyz: np.ndarray
+    """(m, 3) m, sensor frame."""
+    height: np.ndarray
+    """(m,) m above the ground."""
+    tree: KDTree | None
+    """Of their x and y; None without obstacles."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Proposal:
+    """A cluster, and its rectangles at all rotations."""
+
+    members: np.ndarray
+    """(k,) int: rows of its points among the obstacles."""
+    xy: np.ndarray
+    """(j, 2) m: the points that rectangles are fitted to."""
+    curve: np.ndarray
+    """(A,): criterion at each rotation."""
+    extents: np.ndarray
+    """(A, 4) m: see `criterion_curve`."""
+    top_m: float
+    """Height of its highest member above the ground."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """A cluster as a vehicle of one class."""
+
+    proposal: Proposal
+    """The cluster."""
+    completed: CompletedBox
+    """Its box."""
+    around: PointsAround
+    """Points in and round the box."""
+    label: Label
+    """The class."""
+    score: float
+    """In [0, 1]."""
+
+
+def select_options(config: Any, *names: str) -> dict[str, Any]:
+    """The named fields of a config as keyword arguments.
+
+    >>> select_options(ComponentMap(), "cell_m", "num_levels")
+    {'cell_m': 0.2, 'num_levels': 1}
+    """
+    return {name: getattr(config, name) for name in names}
+
+
+def index_obstacles(xyz: np.ndarray, height: np.ndarray, rows: np.ndarray) -> Obstacles:
+    """Gathers obstacles and indexes them by place.
+
+    Args:
+      xyz: (n, 3) m, the sweep.
+      height: (n,) m above the ground.
+      rows: (m,) int, the obstacles among them.
+
+    Returns:
+      The obstacles.
+    """
+    return Obstacles(rows, xyz[rows], height[rows], KDTree(xyz[rows, :2]) if len(rows) else None)
+
+
+def find_clusters(
+    obstacles: Obstacles, component_map: ComponentMap, settings: Any
+) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
+    """Finds the clusters of one component map.
+
+    Args:
+      obstacles: of the sweep, m of them.
+      component_map: the map.
+      settings: of the detector.
+
+    Returns:
+      Component (m,) and cluster (m,) of each obstacle, `NO_CLUSTER` where it has none, and the
+      numbers of occupied cells and of clusters.
+    """
+    fields: Any = component_map
+    clustering = settings.clustering
+    member = (obstacles.height > fields.min_height_m) & (obstacles.height < fields.max_height_m)
+    xy = obstacles.xyz[member, :2]
+    cells, shape = grid_cells(
+        warp_range(xy, start_m=clustering.adaptive_start_m, growth=clustering.adaptive_growth),
+        obstacles.height[member],
+        **select_options(settings.region, "half_x_m", "half_y_m"),
+        **select_options(fields, "cell_m", "num_levels", "min_height_m"),
+    )
+    component = np.full(len(member), NO_CLUSTER)
+    slot = np.full(len(member), NO_CLUSTER)
+    component[member] = label_components(cells, shape)
+    gates = select_options(clustering, "min_points", "max_extent_m")
+    slot[member], num_clusters = keep_clusters(xy, component[member], **gates)
+    slot[slot >= fields.max_clusters] = NO_CLUSTER
+    return component, slot, (len(np.unique(cells, axis=0)), num_clusters)
+
+
+def make_proposals(obstacles: Obstacles, slot: np.ndarray, settings: Any) -> list[Proposal]:
+    """Fits rectangles to the clusters of one map.
+
+    Args:
+      obstacles: of the sweep, m of them.
+      slot: (m,) int, cluster of each, from `find_clusters`.
+      settings: of the detector.
+
+    Returns:
+      One proposal a cluster, in the order of the clusters.
+    """
+    box = settings.box
+    order = np.argsort(slot, kind="stable")
+    order = order[slot[order] != NO_CLUSTER]
+    starts = np.flatnonzero(np.diff(slot[order])) + 1
+    proposals = []
+    for members in np.split(order, starts) if len(order) else []:
+        chosen = fit_points(
+            members,
+            obstacles.height,
+            min_height_m=box.slab_min_height_m,
+            max_height_m=box.slab_max_height_m,
+            **select_options(box, "min_slab_points", "max_points"),
+        )
+        xy = obstacles.xyz[chosen, :2]
+        curve, extents = criterion_curve(
+            xy, **select_options(box, "criterion", "num_angles", "min_distance_m")
+        )
+        proposals.append(Proposal(members, xy, curve, extents, float(obstacles.height[members].max())))
+    return proposals
+
+
+def _complete(
+    proposal: Proposal, preference: np.ndarray, prior: ClassPrior, evidence: Evidence | None, settings: Any
+) -> CompletedBox | None:
+    value = proposal.curve + preference
+    best = int(np.argmax(value))
+    names = ("mode", "num_rays", "free_weight", "free_length_weight", "inside_weight", "near_weight")
+    names += ("closeness_weight", "not_away_cost")
+    return complete_box(
+        proposal.xy,
+        proposal.extents[best],
+        angle=best * np.pi / 2 / len(value),
+        criterion_value=float(value[best]),
+        evidence=evidence,
+        **select_options(prior, "length_m", "width_m", "max_length_m", "max_width_m"),
+        **select_options(settings.completion, *names),
+    )
+
+
+def _preference(proposals: list[Proposal], evidence: Evidence | None, settings: Any) -> np.ndarray:
+    """The gain of each rotation from the direction that the first map's clusters share."""
+    box, car = settings.box, settings.vehicles.classes[Label.CAR]
+    none = np.zeros(box.num_angles)
+    fits = (
+        [(p, _complete(p, none, car, evidence, settings)) for p in proposals] if box.scene_direction else []
+    )
+    fits = [(p, fit) for p, fit in fits if fit is not None]
+    if not fits:
+        return none
+    boxes = np.array([fit.box for _, fit in fits])
+    rays = box_evidence(boxes, evidence, num_rays=settings.completion.num_final_rays)
+    direction = scene_direction(
+        boxes[:, 4],
+        np.array([max(fit.measured_length_m, fit.measured_width_m) for _, fit in fits]),
+        np.array([len(p.members) for p, _ in fits]),
+        rays.free_length,
+        num_angles=box.num_angles,
+        sigma_deg=box.direction_sigma_deg,
+        min_extent_m=box.direction_min_extent_m,
+        max_free=box.direction_max_free,
+    )
+    return direction_preference(
+        direction, num_angles=box.num_angles, weight=box.direction_weight, sigma_deg=box.direction_sigma_deg
+    )
+
+
+def judge_candidates(
+    proposals: list[list[Proposal]], obstacles: Obstacles, evidence: Evidence | None, settings: Any
+) -> list[Candidate]:
+    """Scores every proposal as a car, and the high ones as a van and as a truck too.
+
+    Args:
+      proposals: of each map; the first also gives the scene's direction.
+      obstacles: of the sweep.
+      evidence: of the sweep, or None.
+      settings: of the detector.
+
+    Returns:
+      What scores more than the least score, best first.
+    """
+    vehicles = settings.vehicles
+    preference = _preference(proposals[0], evidence, settings)
+    every = [proposal for of_map in proposals for proposal in of_map]
+    large = [p for p in every if p.top_m > vehicles.large_height_m][: vehicles.max_large]
+    candidates = []
+    for label, chosen in ((Label.CAR, every), (Label.VAN, large), (Label.TRUCK, large)):
+        prior = vehicles.classes[label]
+        for proposal in chosen:
+            completed = _complete(proposal, preference, prior, evidence, settings)
+            if completed is not None:
+                judged = _judge(
+                    proposal, completed, label, obstacles=obstacles, evidence=evidence, settings=settings
+                )
+                candidates.append(judged)
+    candidates = [c for c in candidates if c.score > vehicles.min_score]
+    return sorted(candidates, key=lambda c: -c.score)
+
+
+def _judge(
+    proposal: Proposal,
+    completed: CompletedBox,
+    label: Label,
+    *,
+    obstacles: Obstacles,
+    evidence: Evidence | None,
+    settings: Any,
+) -> Candidate:
+    vehicles, box = settings.vehicles, completed.box
+    prior = vehicles.classes[label]
+    assert obstacles.tree is not None
+    near = obstacles.tree.query_ball_point(box[:2], np.hypot(box[2], box[3]) / 2 + 2 * vehicles.ring_m)
+    around = count_points_around(
+        box,
+        obstacles.xyz[near],
+        obstacles.height[near],
+        **select_options(vehicles, "margin_m", "ring_m"),
+        **select_options(settings.ground, "min_height_m", "max_height_m"),
+        count_max_height_m=prior.count_max_height_m,
+    )
+    rays = box_evidence(box[None], evidence, num_rays=settings.completion.num_final_rays)
+    names = (
+        "top_grade",
+        "min_extent_m",
+        "saturation_points",
+        "sparseness_power",
+        "free_scale",
+        "ring_weight",
+    )
+    names += ("overhead_weight", "support_points", "objective_gate", "objective_softness")
+    score = score_box(
+        box,
+        prior,
+        around=around,
+        **select_options(completed, "objective", "measured_length_m", "measured_width_m"),
+        num_members=len(proposal.members),
+        hit=float(rays.hit[0]),
+        free_length=float(rays.free_length[0]),
+        support=None if evidence is None else support_at(box[:2], evidence),
+        **select_options(vehicles, *names),
+    )
+    return Candidate(proposal, completed, around, label, score)

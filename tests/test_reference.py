@@ -1,0 +1,775 @@
+"""Laws of the reference: each stage against a hand calculation, a brute-force loop or another library."""
+
+import dataclasses
+import itertools
+
+import cv2
+import numpy as np
+import pytest
+from scipy import sparse, spatial
+
+from jaxbox import reference
+from jaxbox.config import CompletionConfig, DetectorConfig, EvidenceConfig, GroundConfig, VehicleConfig
+from jaxbox.types import NUM_POINT_COUNTS, Counts, Label
+
+SENSOR_HEIGHT_M = 1.73
+CAR = VehicleConfig().classes[Label.CAR]
+
+
+def options(config, *names):
+    return {name: getattr(config, name) for name in names}
+
+
+FILTER = {
+    "half_x_m": 20.0,
+    "half_y_m": 20.0,
+    "cell_m": 1.0,
+    "num_levels": 8,
+    "num_iterations": 3,
+    "bandwidth_m": 1.0,
+    "num_std": 4.0,
+    "min_density": 1.1,
+}
+RANSAC = options(
+    GroundConfig(), "num_hypotheses", "num_refits", "tolerance_m", "max_slope_deg", "min_inlier_fraction"
+)
+SURFACE = {
+    "cell_m": 0.5,
+    "half_m": 80.0,
+    **options(
+        GroundConfig(),
+        *("num_envelope_rounds", "max_grade", "band_below_m", "band_below_grade", "band_above_m"),
+        *("band_above_grade", "blind_radius_m", "envelope_margin_m", "smoothing_m"),
+    ),
+}
+EVIDENCE = {
+    field.name: field.default for field in dataclasses.fields(EvidenceConfig) if field.name != "enabled"
+}
+COMPLETE = {
+    **options(CAR, "length_m", "width_m", "max_length_m", "max_width_m"),
+    **options(
+        CompletionConfig(),
+        *("num_rays", "free_weight", "free_length_weight", "inside_weight", "near_weight"),
+        *("closeness_weight", "not_away_cost"),
+    ),
+}
+SCORE = options(
+    VehicleConfig(),
+    *("top_grade", "min_extent_m", "saturation_points", "sparseness_power", "free_scale", "ring_weight"),
+    *("overhead_weight", "support_points", "objective_gate", "objective_softness"),
+)
+AROUND = {
+    "margin_m": 0.1,
+    "ring_m": 0.5,
+    "min_height_m": 0.2,
+    "count_max_height_m": 2.0,
+    "max_height_m": 4.0,
+}
+
+
+def turned(xy, yaw):
+    return xy @ np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+
+
+def moved(box, *, x=0.0, length=0.0, width=0.0):
+    return np.add(box, [x, 0, length, width, 0])
+
+
+def lidar_sweep(boxes, *, noise_m=0.01, seed=0):
+    """A 64-beam sweep of flat ground and upright boxes (x, y, length, width, yaw, height)."""
+    rng = np.random.default_rng(seed)
+    azimuth, elevation = np.meshgrid(
+        np.radians(np.arange(-60, 60, 0.2)), np.radians(np.linspace(-24.9, 2, 64))
+    )
+    ray = np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
+    )
+    ray = ray.reshape(3, -1).T
+    distance = np.where(ray[:, 2] < 0, SENSOR_HEIGHT_M / np.maximum(-ray[:, 2], 1e-9), np.inf)
+    for x, y, length, width, yaw, height in boxes:
+        start = np.append(turned(np.array([-x, -y]), -yaw), 0.0)
+        local = np.column_stack([turned(ray[:, :2], -yaw), ray[:, 2]])
+        low = np.array([-length / 2, -width / 2, -SENSOR_HEIGHT_M])
+        high = np.array([length / 2, width / 2, height - SENSOR_HEIGHT_M])
+        sides = np.stack([(low - start) / local, (high - start) / local])
+        entry, leave = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
+        distance = np.where((entry < leave) & (entry > 0), np.minimum(distance, entry), distance)
+    seen = distance < 70
+    return (distance[seen] + rng.normal(0, noise_m, seen.sum()))[:, None] * ray[seen]
+
+
+# ---------------------------------------------------------------- filtering
+
+
+def test_filter_keeps_dense_points_and_drops_the_lone_one():
+    dense = np.random.default_rng(0).normal(0, 0.3, (200, 3))
+    inlier = reference.filter_outliers(np.vstack([dense, [[15.5, 15.5, 0.5]]]), **FILTER)
+    assert inlier[:200].all()
+    assert not inlier[200]
+
+
+@pytest.mark.parametrize("offset", list(itertools.product((0, 1), repeat=3)))
+def test_window_weight_is_the_gaussian_of_the_cells_between(offset):
+    pair = np.array([[0.5, 0.5, 0.5], np.array([0.5, 0.5, 0.5]) + offset])
+    weight = 1 + np.exp(-0.5) ** sum(offset)
+    for shift, expected in ((-1e-9, True), (1e-9, False)):
+        inlier = reference.filter_outliers(pair, **(FILTER | {"min_density": weight + shift, "num_std": 1e9}))
+        assert inlier.tolist() == [expected, expected]
+
+
+def test_one_mean_shift_step_reaches_the_centroid_of_the_window():
+    # 9 points in one cell and one at the far corner of the next: only that one is far from its centroid.
+    xyz = np.vstack([np.full((9, 3), 0.1), [[1.9, 0.1, 0.1]]])
+    w = np.exp(-0.5)
+    distance = np.array([*[1.8 * w / (9 + w)] * 9, 1.8 * 9 * w / (9 * w + 1)])
+    t = (distance[9] - distance.mean()) / distance.std()
+    for shift, expected in ((1e-6, True), (-1e-6, False)):
+        changes = {"num_iterations": 1, "num_std": t + shift}
+        assert reference.filter_outliers(xyz, **(FILTER | changes))[9] == expected
+
+
+def test_selection_counts_nan_as_not_finite_and_the_border_as_outside():
+    xyz = np.array([[0, 0, 0], [np.nan, 0, 0], [0, np.inf, 0], [80, 0, 0], [0, -59.9, 1e30]], np.float32)
+    finite, valid = reference.select_points(xyz, half_x_m=80.0, half_y_m=60.0)
+    assert finite.tolist() == [True, False, False, True, True]
+    assert valid.tolist() == [True, False, False, False, True]
+
+
+# ---------------------------------------------------------------- ground
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_ransac_recovers_a_tilted_plane_among_a_third_of_clutter(seed):
+    rng = np.random.default_rng(seed)
+    truth = np.array([0.05, -0.03, -1.7])
+    xy = rng.uniform(-30, 30, (600, 2))
+    z = xy @ truth[:2] + truth[2] + rng.normal(0, 0.02, 600)
+    z[:200] += rng.uniform(0.5, 3, 200)
+    plane, found, count = reference.fit_ground_plane(np.column_stack([xy, z]), rng=rng, **RANSAC)
+    assert found
+    assert count == 400
+    assert (np.abs(plane - truth) < [3e-4, 3e-4, 5e-3]).all()
+
+
+@pytest.mark.parametrize("slope", [0.3, 50.0])
+def test_no_ground_is_found_on_a_slope_steeper_than_the_gate(slope):
+    xy = np.random.default_rng(0).uniform(-5, 5, (300, 2))
+    z = slope * xy[:, 0]
+    plane, found, _ = reference.fit_ground_plane(
+        np.column_stack([xy, z]), rng=np.random.default_rng(0), **RANSAC
+    )
+    assert not found
+    np.testing.assert_array_equal(plane, [0, 0, z.min()])
+
+
+@pytest.mark.parametrize("points", [[], [[1, 2, -3]], [[1, 2, -3], [4, 5, 6]], [[1, 1, -3]] * 5])
+def test_too_few_or_repeated_candidates_give_a_level_plane_at_the_lowest(points):
+    candidates = np.array(points, float).reshape(-1, 3)
+    plane, found, _ = reference.fit_ground_plane(candidates, rng=np.random.default_rng(0), **RANSAC)
+    assert not found
+    assert plane.tolist() == [0, 0, -3 if len(points) else 0]
+
+
+def test_repeated_ransac_finds_both_levels_and_points_stand_on_the_one_below_them():
+    rng = np.random.default_rng(1)
+    xy = rng.uniform(-20, 20, (500, 2))
+    z = np.where(np.arange(500) < 300, -1.7, -0.7)
+    fits = reference.fit_ground_planes(np.column_stack([xy, z]), max_planes=3, rng=rng, **RANSAC)
+    planes = np.array([plane for plane, _, _ in fits])
+    np.testing.assert_allclose(planes[:, 2], [-1.7, -0.7], atol=1e-9)
+    probes = np.array([[0, 0, -1.0], [0, 0, -0.8], [0, 0, 0.5], [0, 0, -5]])
+    elevation = reference.plane_elevation(probes, planes, min_height_m=0.2)
+    np.testing.assert_allclose(elevation, [-1.7, -0.7, -0.7, -1.7], atol=1e-9)
+
+
+def test_cell_minima_match_a_loop_over_the_cells():
+    xyz = np.random.default_rng(2).uniform([-50, -30, -2], [50, 30, 2], (3000, 3))
+    lowest = {}
+    for x, y, z in xyz[(np.abs(xyz[:, 0]) < 40) & (np.abs(xyz[:, 1]) < 20)]:
+        cell = (np.floor(x) + 0.5, np.floor(y) + 0.5)
+        lowest[cell] = min(z, lowest.get(cell, np.inf))
+    expected = np.array([(*cell, z) for cell, z in sorted(lowest.items())])
+    np.testing.assert_allclose(reference.cell_minima(xyz, half_x_m=40, half_y_m=20), expected)
+
+
+def test_surface_of_a_flat_ground_is_the_plane_and_follows_a_gentle_rise():
+    rng = np.random.default_rng(3)
+    xy = rng.uniform(-40, 40, (60000, 2))
+    rise = np.clip((xy[:, 0] - 10) * 0.03, 0, 0.4)
+    plane = np.array([0.01, 0.02, -1.7])
+    for deviation, tolerance in ((np.zeros(len(xy)), 1e-9), (rise, 0.05)):
+        xyz = np.column_stack([xy, xy @ plane[:2] + plane[2] + deviation])
+        grid = reference.fit_ground_surface(xyz, plane, **SURFACE)
+        height = reference.height_above_ground(xyz, plane, grid, cell_m=0.5, half_m=80.0)
+        inner = (np.abs(xy) < 35).all(axis=1) & (np.hypot(*xy.T) > 5)
+        assert np.abs(height[inner]).max() < tolerance
+
+
+def test_envelope_keeps_a_steep_block_out_of_the_ground():
+    xy = np.random.default_rng(4).uniform(-30, 30, (60000, 2))
+    block = (np.abs(xy - [12, 0]) < 1).all(axis=1)
+    xyz = np.column_stack([xy, np.where(block, -0.9, -1.7)])
+    plane = np.array([0.0, 0.0, -1.7])
+    grid = reference.fit_ground_surface(xyz, plane, **SURFACE)
+    height = reference.height_above_ground(xyz, plane, grid, cell_m=0.5, half_m=80.0)
+    assert height[block].min() > 0.75
+
+
+def test_surface_is_bilinear_between_cell_centres_and_constant_beyond_the_border():
+    centers = np.arange(8) - 3.5
+    grid = 2 * centers[:, None] + 3 * centers[None, :]
+    xy = np.array([[0.2, 0.9], [-3.5, 3.5], [100, -100]])
+    deviation = reference.surface_deviation(xy, grid, cell_m=1.0, half_m=4.0)
+    np.testing.assert_allclose(deviation, [3.1, 3.5, -3.5])
+
+
+# ---------------------------------------------------------------- clusters
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("shape", [(30, 20), (12, 10, 6)])
+def test_components_match_a_flood_fill_from_each_cell_in_row_major_order(shape, seed):
+    rng = np.random.default_rng(seed)
+    cells = rng.integers(0, shape, (np.prod(shape) // 6, len(shape)))
+    occupied = {tuple(cell) for cell in cells.tolist()}
+    expected, count = {}, 0
+    for start in sorted(occupied):
+        stack = [] if start in expected else [start]
+        while stack:
+            cell = stack.pop()
+            if cell in occupied and cell not in expected:
+                expected[cell] = count
+                steps = itertools.product((-1, 0, 1), repeat=len(shape))
+                stack += [tuple(np.add(cell, step).tolist()) for step in steps]
+        count = max(expected.values()) + 1
+    component = reference.label_components(cells, shape)
+    assert component.tolist() == [expected[tuple(cell)] for cell in cells.tolist()]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_algorithm_two_matches_the_components_of_the_radius_graph(seed):
+    xyz = np.random.default_rng(seed).uniform(0, 10, (300, 3))
+    graph = spatial.distance.squareform(spatial.distance.pdist(xyz)) <= 1.2
+    count, expected = sparse.csgraph.connected_components(graph)
+    cluster = reference.euclidean_clusters(xyz, radius_m=1.2)
+    assert 1 < count == cluster.max() + 1
+    assert cluster.tolist() == expected.tolist()
+
+
+def test_points_linked_within_one_cell_edge_share_a_grid_component():
+    xy = np.random.default_rng(0).uniform(-10, 10, (800, 2))
+    cluster = reference.euclidean_clusters(xy, radius_m=0.5)
+    cells, shape = reference.grid_cells(
+        xy, np.zeros(800), cell_m=0.5, num_levels=1, half_x_m=10.0, half_y_m=10.0, min_height_m=0.2
+    )
+    component = reference.label_components(cells, shape)
+    assert cluster.max() > component.max() > 0
+    for index in range(cluster.max() + 1):
+        assert len(set(component[cluster == index])) == 1
+
+
+def test_levels_of_a_three_dimensional_map_part_what_is_stacked():
+    xy, height = np.zeros((3, 2)), np.array([0.3, 0.7, 3.9])
+    grid = {"cell_m": 0.4, "half_x_m": 4.0, "half_y_m": 4.0, "min_height_m": 0.2}
+    flat, flat_shape = reference.grid_cells(xy, height, num_levels=1, **grid)
+    tall, tall_shape = reference.grid_cells(xy, height, num_levels=8, **grid)
+    assert reference.label_components(flat, flat_shape).tolist() == [0, 0, 0]
+    assert tall[:, 2].tolist() == [0, 1, 7]
+    assert reference.label_components(tall, tall_shape).tolist() == [0, 0, 1]
+
+
+def test_warp_keeps_directions_and_near_points_and_grows_the_linking_distance_linearly():
+    direction = np.array([np.cos(0.7), np.sin(0.7)])
+    rho = np.array([0.0, 5.0, 20.0, 40.0, 70.0])
+    warped = reference.warp_range(rho[:, None] * direction, start_m=20.0, growth=0.02)
+    np.testing.assert_allclose(warped[:3], rho[:3, None] * direction)
+    np.testing.assert_allclose(np.arctan2(warped[1:, 1], warped[1:, 0]), 0.7)
+    step = 1e-4
+    near, far = (
+        np.hypot(*reference.warp_range((rho[3:] + s)[:, None] * direction, start_m=20.0, growth=0.02).T)
+        for s in (0, step)
+    )
+    np.testing.assert_allclose(step / (far - near), 1 + 0.02 * (rho[3:] - 20), rtol=1e-4)
+    assert reference.warp_range(warped, start_m=20.0, growth=0.0) is warped
+
+
+def test_size_gates_keep_their_limits_and_number_what_is_left_in_order():
+    component = np.repeat([0, 1, 2, 3], [3, 8, 8, 9])
+    xy = np.zeros((28, 2))
+    xy[3, 1], xy[11, 0] = 12.0, 12.5
+    slot, count = reference.keep_clusters(xy, component, min_points=8, max_extent_m=12.0)
+    assert count == 2
+    assert slot.tolist() == [-1] * 3 + [0] * 8 + [-1] * 8 + [1] * 9
+
+
+# ---------------------------------------------------------------- hull, rectangle, descriptors
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_hull_is_counter_clockwise_and_that_of_qhull(seed):
+    xy = np.random.default_rng(seed).normal(0, 3, (100, 2)).astype(np.float32)
+    hull = reference.convex_hull(xy)
+    expected = spatial.ConvexHull(xy)
+    assert reference.signed_area(hull) == pytest.approx(expected.volume)
+    assert {tuple(v) for v in hull.tolist()} == {
+        tuple(v) for v in xy[expected.vertices].astype(float).tolist()
+    }
+
+
+@pytest.mark.parametrize("points", [[], [[1, 2]], [[1, 2]] * 4, [[0, 0], [1, 1], [2, 2], [3, 3]]])
+def test_hull_and_descriptors_of_degenerate_points_are_finite(points):
+    xy = np.array(points, float).reshape(-1, 2)
+    hull = reference.convex_hull(xy)
+    descriptors = reference.shape_descriptors(xy, hull)
+    assert len(hull) <= 2
+    assert descriptors.density == 0
+    assert descriptors.eccentricity >= 1
+    assert np.isfinite(
+        [*descriptors.moment_of_inertia, descriptors.eccentricity, descriptors.complexity]
+    ).all()
+
+
+@pytest.mark.parametrize("yaw", [-1.5, -0.4, 0.3, 1.2])
+def test_min_area_rectangle_recovers_a_turned_rectangle(yaw):
+    corners = np.array([[2.0, 0.8], [-2.0, 0.8], [-2.0, -0.8], [2.0, -0.8]])
+    center, size, found_yaw = reference.min_area_rectangle(np.add(turned(corners, yaw), [20, -7]))
+    np.testing.assert_allclose(center, [20, -7], atol=1e-5)
+    np.testing.assert_allclose(size, [4.0, 1.6], atol=1e-5)
+    assert found_yaw == pytest.approx(yaw, abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_area_curve_reaches_rotating_calipers_within_the_bound_of_its_step(seed):
+    xy = np.add(turned(np.random.default_rng(seed).uniform([-2, -1], [2, 1], (60, 2)), seed), [15, 4])
+    curve, extents = reference.criterion_curve(xy, criterion="area", num_angles=90, min_distance_m=0.05)
+    _, (length, width), _ = reference.min_area_rectangle(xy)
+    half_step = np.radians(0.5)
+    bound = (length + width * half_step) * (width + length * half_step)
+    assert length * width - 1e-4 <= -curve.max() <= bound
+    np.testing.assert_allclose(-curve, (extents[:, 1] - extents[:, 0]) * (extents[:, 3] - extents[:, 2]))
+
+
+def slow_criterion(xy, criterion, angle, min_distance):
+    cos, sin = np.cos(angle), np.sin(angle)
+    uv = [(x * cos + y * sin, -x * sin + y * cos) for x, y in xy]
+    edges = [(min(c), max(c)) for c in zip(*uv, strict=True)]
+    distances = [[min(abs(c - e) for e in edges[k]) for k, c in enumerate(point)] for point in uv]
+    if criterion == "variance":
+        groups = [[d[0] for d in distances if d[0] < d[1]], [d[1] for d in distances if d[1] <= d[0]]]
+        return -sum(np.var(group) for group in groups if group)
+    if criterion == "visible_closeness":
+        faces = [min(e, key=abs) for e in edges]
+        distances = [[abs(c - f) for c, f in zip(point, faces, strict=True)] for point in uv]
+    return np.mean([min_distance / max(min(d), min_distance) for d in distances])
+
+
+@pytest.mark.parametrize("criterion", ["variance", "closeness", "visible_closeness"])
+def test_criterion_curve_matches_a_loop_over_points_and_angles(criterion):
+    xy = np.add(turned(np.random.default_rng(5).uniform([-2, -1], [2, 1], (40, 2)), 0.4), [-9, 6])
+    curve, _ = reference.criterion_curve(xy, criterion=criterion, num_angles=18, min_distance_m=0.05)
+    expected = [slow_criterion(xy, criterion, np.radians(5 * i), 0.05) for i in range(18)]
+    np.testing.assert_allclose(curve, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("criterion", ["area", "variance", "closeness", "visible_closeness"])
+def test_every_criterion_finds_the_angle_of_a_corner_facing_the_sensor(criterion):
+    along = np.column_stack([np.linspace(0, 4, 41), np.zeros(41)])
+    across = np.column_stack([np.zeros(17), np.linspace(0, 1.6, 17)])
+    xy = np.add(turned(np.vstack([along, across]), np.radians(27)), [10, 8])
+    curve, _ = reference.criterion_curve(xy, criterion=criterion, num_angles=90, min_distance_m=0.05)
+    assert np.argmax(curve) == 27
+
+
+def test_unknown_criterion_is_refused_by_name():
+    with pytest.raises(ValueError, match="criterion is 'perimeter'; it must be area"):
+        reference.criterion_curve(np.ones((3, 2)), criterion="perimeter", num_angles=9, min_distance_m=0.1)
+
+
+def test_fit_points_are_the_slab_or_all_and_spread_evenly():
+    members = np.arange(100, 120)
+    height = np.zeros(200)
+    height[104:] = 0.5
+    rule = {"min_height_m": 0.2, "max_height_m": 0.8, "min_slab_points": 5}
+    assert reference.fit_points(members, height, max_points=99, **rule).tolist() == list(range(104, 120))
+    assert reference.fit_points(members, height, max_points=5, **rule).tolist() == [104, 107, 110, 113, 116]
+    assert reference.fit_points(members[:8], height, max_points=99, **rule).tolist() == list(range(100, 108))
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.5, 2.0])
+def test_descriptors_of_a_filled_rectangle_are_those_of_the_textbook(yaw):
+    grid = np.stack(np.meshgrid(np.linspace(-2, 2, 401), np.linspace(-0.5, 0.5, 101)), -1).reshape(-1, 2)
+    xy = turned(grid, yaw)
+    descriptors = reference.shape_descriptors(xy, reference.convex_hull(xy[[0, 400, -401, -1]]))
+    np.testing.assert_allclose(descriptors.moment_of_inertia, [16 / 12, 1 / 12], rtol=0.03)
+    assert descriptors.eccentricity == pytest.approx(4, rel=0.02)
+    assert descriptors.density == pytest.approx(len(xy) / 4, rel=1e-6)
+    assert descriptors.complexity == 4 / len(xy)
+
+
+# ---------------------------------------------------------------- evidence
+
+
+def test_one_beam_to_the_ground_frees_the_cells_where_it_is_between_the_heights():
+    xyz = np.array([[20.1, 0.0, -SENSOR_HEIGHT_M]])
+    evidence = reference.build_evidence(xyz, np.zeros(1), sensor_height_m=SENSOR_HEIGHT_M, **EVIDENCE)
+    free = np.diff(evidence.free_sums, axis=1) > 0
+    start, end = (20.1 * (SENSOR_HEIGHT_M - h) / SENSOR_HEIGHT_M for h in (0.8, 0.35))
+    wholly = [k for k in range(320) if k * 0.25 >= start and (k + 1) * 0.25 <= end]
+    azimuth, cells = np.nonzero(free)
+    assert set(azimuth) == {720}
+    assert cells.tolist() == wholly
+    assert evidence.hit_sums.max() == 0
+
+
+def test_a_beam_that_ends_between_the_heights_is_free_up_to_the_gap_and_hits():
+    xyz = np.array([[0.0, 12.6, -1.23]])
+    evidence = reference.build_evidence(xyz, np.array([0.5]), sensor_height_m=SENSOR_HEIGHT_M, **EVIDENCE)
+    _, cells = np.nonzero(np.diff(evidence.free_sums, axis=1))
+    assert cells.min() == int(12.6 * 0.93 / 1.23 / 0.25) + 1
+    assert cells.max() == int((12.6 - 0.3) / 0.25) - 1
+    azimuth, hit = np.nonzero(np.diff(evidence.hit_sums, axis=1))
+    assert (azimuth.tolist(), hit.tolist()) == ([1080], [50])
+
+
+def wall_evidence():
+    """A wall 10 m ahead, 4 m wide, with ground up to 40 m elsewhere."""
+    xyz = lidar_sweep([(10.1, 0.0, 0.2, 4.0, 0.0, 3.0)], noise_m=0.0)
+    height = xyz[:, 2] + SENSOR_HEIGHT_M
+    return reference.build_evidence(xyz, height, sensor_height_m=SENSOR_HEIGHT_M, **EVIDENCE)
+
+
+def test_boxes_at_before_and_behind_a_wall_and_in_the_open_are_hit_free_hidden_and_free():
+    boxes = np.array([[11.0, 0, 2, 3, 0], [12.0, 12, 3, 2, 0.3], [25.0, 0, 3.9, 1.6, 0.2]])
+    rays = reference.box_evidence(boxes, wall_evidence(), num_rays=48)
+    np.testing.assert_allclose(rays.hit, [1, 0, 0])
+    # Rays over the corners of a box are too short to cover a whole range cell.
+    assert rays.free[1] > 0.7
+    np.testing.assert_allclose(rays.free + rays.occluded, [0, 1, 1])
+    np.testing.assert_allclose(rays.free_length > 0.9, [False, True, False])
+    assert rays.free_length[2] == 0
+    deep = reference.box_evidence(np.array([[8.5, 0, 4.0, 2.0, 0]]), wall_evidence(), num_rays=48)
+    assert deep.hit[0] == 0
+    assert deep.free_length[0] > 0.4
+
+
+def test_ray_shares_sum_to_one_and_a_mirrored_sweep_gives_mirrored_shares():
+    rng = np.random.default_rng(7)
+    xyz = rng.uniform([-40, -40, -1.7], [40, 40, 0], (4000, 3))
+    boxes = np.column_stack(
+        [rng.uniform(5, 35, 50), rng.uniform(-30, 30, 50), rng.uniform(1, 5, (50, 2)), rng.uniform(-3, 3, 50)]
+    )
+    shares = []
+    for sign in (1, -1):
+        height = xyz[:, 2] + SENSOR_HEIGHT_M
+        evidence = reference.build_evidence(
+            xyz * [1, sign, 1], height, sensor_height_m=SENSOR_HEIGHT_M, **EVIDENCE
+        )
+        rays = reference.box_evidence(boxes * [1, sign, 1, 1, sign], evidence, num_rays=33)
+        shares.append([rays.hit, rays.free, rays.occluded, rays.deep, rays.free_length])
+    np.testing.assert_allclose(np.sum(shares[0][:4], axis=0), 1)
+    # The middle ray of a box may fall on the border of two azimuth cells: one ray of 33.
+    np.testing.assert_allclose(shares[0], shares[1], atol=1.01 / 33)
+    assert np.std(shares[0], axis=1).min() > 0.01
+
+
+def test_without_evidence_every_ray_counts_as_hit():
+    rays = reference.box_evidence(np.ones((3, 5)), None, num_rays=8)
+    assert rays.hit.tolist() == [1, 1, 1]
+    assert rays.free.tolist() == rays.free_length.tolist() == [0, 0, 0]
+
+
+def test_ground_support_counts_the_seven_by_seven_cells_round_a_place():
+    rng = np.random.default_rng(8)
+    xyz = rng.uniform([-30, -30, -0.3], [30, 30, 0.3], (5000, 3))
+    evidence = reference.build_evidence(xyz, xyz[:, 2], sensor_height_m=SENSOR_HEIGHT_M, **EVIDENCE)
+    for place in ([0.5, 0.5], [-12.3, 7.7], [29.0, -29.0]):
+        low = np.floor(place) - 3
+        inside = ((xyz[:, :2] >= low) & (xyz[:, :2] < low + 7)).all(axis=1) & (np.abs(xyz[:, 2]) < 0.15)
+        assert reference.support_at(np.array(place), evidence) == inside.sum()
+
+
+# ---------------------------------------------------------------- completion
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_extents_grow_away_from_the_sensor_towards_it_or_both_ways(sign):
+    low, high = sorted((5.0 * sign, 7.0 * sign))
+    assert reference.complete_extent(low, high, 4.0, 0) == (7.0 * sign, 4.0)
+    assert reference.complete_extent(low, high, 4.0, 1) == (5.0 * sign, 4.0)
+    assert reference.complete_extent(low, high, 4.0, 2) == (6.0 * sign, 4.0)
+    assert reference.complete_extent(low, high, 1.0, 0) == (6.0 * sign, 2.0)
+    assert reference.complete_extent(5.0 * sign, 5.0 * sign, 4.0, 0) == (7.0 * sign, 4.0)
+
+
+def complete(xy, *, mode, evidence=None, angle_deg=0):
+    curve, extents = reference.criterion_curve(
+        xy, criterion="visible_closeness", num_angles=90, min_distance_m=0.05
+    )
+    return reference.complete_box(
+        xy,
+        extents[angle_deg],
+        angle=np.radians(angle_deg),
+        criterion_value=curve[angle_deg],
+        evidence=evidence,
+        mode=mode,
+        **COMPLETE,
+    )
+
+
+def test_away_keeps_the_visible_faces_and_extends_the_hidden_ones_to_the_prior():
+    rear_and_side = np.array([[10.0, 3.0], [10.0, 4.2], [12.5, 3.0]])
+    completed = complete(rear_and_side, mode="away")
+    np.testing.assert_allclose(completed.box, [10 + 3.9 / 2, 3 + 1.63 / 2, 3.9, 1.63, 0])
+    assert (completed.measured_length_m, completed.measured_width_m) == pytest.approx((2.5, 1.2))
+
+
+@pytest.mark.parametrize("long_axis", [0, 1])
+def test_none_is_the_rectangle_as_measured_with_the_longer_side_as_length(long_axis):
+    xy = np.array([[10.0, 3.0], [10.0, 4.2], [12.5, 3.0]])[:, :: 1 - 2 * long_axis]
+    completed = complete(xy, mode="none")
+    np.testing.assert_allclose(completed.box[2:4], [2.5, 1.2])
+    np.testing.assert_allclose(completed.box[:2], (xy.min(axis=0) + xy.max(axis=0)) / 2)
+    assert completed.box[4] == pytest.approx(long_axis * np.pi / 2)
+
+
+def test_a_cluster_larger_than_the_class_is_no_box():
+    for mode in ("none", "away", "evidence"):
+        assert complete(np.array([[10.0, -4.0], [10.0, 4.0], [17.0, 0.0]]), mode=mode) is None
+
+
+def test_evidence_turns_a_rear_face_into_a_car_that_points_away_from_the_sensor():
+    xyz = lidar_sweep([(14.0, 2.0, 3.9, 1.6, 0.0, 1.5)], noise_m=0.0)
+    height = xyz[:, 2] + SENSOR_HEIGHT_M
+    evidence = reference.build_evidence(xyz, height, sensor_height_m=SENSOR_HEIGHT_M, **EVIDENCE)
+    rear = xyz[(height > 0.2) & (height < 0.8) & (np.abs(xyz[:, 0] - 12.05) < 0.02), :2]
+    completed = complete(rear, mode="evidence", evidence=evidence)
+    np.testing.assert_allclose(completed.box[:2], [14.0, 2.0], atol=0.1)
+    assert np.cos(completed.box[4]) ** 2 == pytest.approx(1)
+    assert completed.objective > 2.4
+
+
+def test_points_on_the_visible_faces_agree_fully_and_points_behind_agree_less():
+    box = np.array([[10.0, 5.0, 4.0, 2.0, 0.0]])
+    faces = np.array([[8.0, 4.5], [8.0, 5.5], [9.0, 4.0], [11.0, 4.0]])
+    inside, near = reference.point_agreement(box, faces)
+    assert (inside[0], near[0]) == (1, 1)
+    inside, near = reference.point_agreement(box, np.array([[11.5, 5.5], [13.0, 9.0]]))
+    assert inside[0] == 0.5
+    assert near[0] == pytest.approx(0.1 / 1.5 / 2)
+
+
+def test_scene_direction_is_the_heavier_vote_modulo_a_quarter_turn():
+    rules = {"num_angles": 90, "sigma_deg": 3.0, "min_extent_m": 2.2, "max_free": 0.15}
+    yaw = np.radians([20, 110, -70, 50, 51, 52])
+    extent, points = np.full(6, 4.0), np.full(6, 100)
+    free = np.array([0, 0, 0, 0, 0.5, 0.5])
+    assert reference.scene_direction(yaw, extent, points, free, **rules) == 20
+    assert reference.scene_direction(yaw, extent, points * [1, 0, 0, 9, 1, 1], free, **rules) == 50
+    assert reference.scene_direction(yaw, extent * 0.5, points, free, **rules) is None
+    gain = reference.direction_preference(89.0, num_angles=90, weight=0.2, sigma_deg=3.0)
+    np.testing.assert_allclose(gain[[89, 0, 86]], 0.2 * np.exp([0, -1 / 9, -1]))
+    assert not reference.direction_preference(None, num_angles=90, weight=0.2, sigma_deg=3.0).any()
+
+
+# ---------------------------------------------------------------- vehicles
+
+
+def test_points_round_a_box_are_shared_out_by_margin_ring_and_height():
+    box = np.array([10.0, 0.0, 4.0, 2.0, np.pi / 2])
+    xyz = np.array(
+        [[10, 0, 0], [11.05, 0, 0], [11.2, 0, 0], [10, 2.4, 0], [11.6, 0, 0], [10, 0, 0], [10, 1, 0.0]]
+    )
+    height = np.array([1.0, 1.4, 1.0, 0.5, 1.0, 2.5, 4.5])
+    around = reference.count_points_around(box, xyz, height, **AROUND)
+    assert (around.inside, around.top_m, around.overhead, around.ring) == (2, 1.4, 1, 2)
+
+
+PERFECT = {
+    "around": reference.PointsAround(inside=100, top_m=1.5, overhead=0, ring=0),
+    "objective": np.inf,
+    "measured_length_m": 3.9,
+    "measured_width_m": 1.63,
+    "num_members": 100,
+    "hit": 1.0,
+    "free_length": 0.0,
+    "support": 100.0,
+}
+PERFECT_BOX = np.array([10.0, 0.0, 3.9, 1.63, 0.0])
+
+
+def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
+    def score(box=PERFECT_BOX, **faults):
+        return reference.score_box(box, CAR, **(PERFECT | faults), **SCORE)
+
+    around = PERFECT["around"]
+    assert score() == 1
+    assert score(support=None) == 1
+    assert score(moved(PERFECT_BOX, length=-0.8)) == pytest.approx(np.exp(-1))
+    assert score(moved(PERFECT_BOX, length=2.0)) == pytest.approx(np.exp(-1))
+    assert score(moved(PERFECT_BOX, width=0.3)) == pytest.approx(np.exp(-1))
+    assert score(num_members=50) == pytest.approx(0.5**0.3)
+    assert score(hit=0.25) == 0.25
+    assert score(free_length=0.15) == pytest.approx(np.exp(-1))
+    assert score(support=4.5) == pytest.approx(0.5)
+    assert score(objective=2.4) == pytest.approx(0.5)
+    assert score(around=dataclasses.replace(around, ring=25)) == pytest.approx(np.exp(-2))
+    assert score(around=dataclasses.replace(around, overhead=50)) == pytest.approx(np.exp(-4))
+    assert score(around=dataclasses.replace(around, top_m=1.8)) == pytest.approx(np.exp(-1))
+    # A top that reads low far away may be higher by the range allowance.
+    low = dataclasses.replace(around, top_m=1.2)
+    assert score(around=low) == pytest.approx(np.exp(-((0.225 / 0.3) ** 2)))
+    assert score(moved(PERFECT_BOX, x=30), around=low) == 1
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        {"around": reference.PointsAround(inside=9, top_m=0.92, overhead=0, ring=0)},
+        {"around": reference.PointsAround(inside=9, top_m=2.3, overhead=0, ring=0)},
+        {"measured_length_m": 0.99, "measured_width_m": 0.99},
+    ],
+)
+def test_each_gate_closes(fault):
+    assert reference.score_box(PERFECT_BOX, CAR, **(PERFECT | fault), **SCORE) == 0
+
+
+def test_overlap_is_one_on_itself_symmetric_and_that_of_two_squares_at_45_degrees():
+    square, turned_square = np.array([50.0, -30.0, 1, 1, 0]), np.array([50.0, -30.0, 1, 1, np.pi / 4])
+    shared = 2 * (np.sqrt(2) - 1)
+    assert reference.bev_iou(square, square) == pytest.approx(1, abs=1e-5)
+    assert reference.bev_iou(square, turned_square) == pytest.approx(shared / (2 - shared), abs=1e-5)
+    rng = np.random.default_rng(9)
+    for first, second in rng.uniform([0, 0, 1, 1, -3], [2, 2, 4, 4, 3], (20, 2, 5)):
+        assert reference.bev_iou(first, second) == pytest.approx(reference.bev_iou(second, first), abs=1e-5)
+    assert reference.bev_iou(square, moved(square, x=3)) == 0
+
+
+def test_suppression_keeps_the_best_of_each_group_in_order_of_score():
+    box = np.array([10.0, 0.0, 4.0, 2.0, 0.1])
+    boxes = np.array([box, moved(box, x=1), moved(box, x=20), moved(box, x=3.9)])
+    scores = np.array([0.5, 0.7, 0.9, 0.1])
+    assert reference.suppress(boxes, scores, max_overlap=0.1).tolist() == [2, 1]
+    assert reference.suppress(boxes, scores, max_overlap=0.2).tolist() == [2, 1, 3]
+    assert reference.suppress(np.zeros((0, 5)), np.zeros(0), max_overlap=0.1).tolist() == []
+
+
+# ---------------------------------------------------------------- detect
+
+CARS = [
+    (12.0, 3.0, 3.9, 1.63, 0.3, 1.5),
+    (18.0, -6.0, 3.9, 1.63, 0.3, 1.5),
+    (22.0, 14.0, 3.9, 1.63, 0.3, 1.5),
+]
+
+
+def test_cars_on_flat_ground_are_found_where_they_stand():
+    sweep = lidar_sweep(CARS)
+    detections = reference.detect(sweep)
+    assert detections.found
+    np.testing.assert_allclose(detections.coefficients, [0, 0, -SENSOR_HEIGHT_M], atol=0.02)
+    for x, y, length, width, yaw, height in CARS:
+        row = np.argmin(np.hypot(*(detections.center[:, :2] - [x, y]).T))
+        assert detections.score[row] > 0.3
+        assert detections.label[row] == Label.CAR
+        np.testing.assert_allclose(detections.center[row], [x, y, height / 2 - SENSOR_HEIGHT_M], atol=0.15)
+        np.testing.assert_allclose(detections.size[row], [length, width, height], atol=0.1)
+        assert np.degrees(detections.yaw[row]) == pytest.approx(np.degrees(yaw), abs=2)
+        own = sweep[detections.point_detection == row]
+        assert len(own) == detections.num_points[row] > 30
+        outside = reference.distance_outside(own[:, :2], np.array([x, y, length, width, yaw]))
+        assert outside.max() < 0.25
+
+
+def test_a_sweep_turned_half_round_gives_boxes_turned_half_round():
+    first = reference.detect(lidar_sweep(CARS))
+    second = reference.detect(lidar_sweep(CARS) * [-1, -1, 1])
+    for detections, other, sign in ((first, second, -1), (second, first, -1)):
+        for center in detections.center[detections.score > 0.3]:
+            gap = np.linalg.norm(other.center - center * [sign, sign, 1], axis=1)
+            assert gap.min() < 0.1
+
+
+def test_the_paper_preset_keeps_the_extent_of_the_cluster():
+    sweep = lidar_sweep([(12.0, 3.0, 3.9, 1.63, 1.0, 1.5)])
+    detections = reference.detect(sweep, DetectorConfig.paper())
+    own = sweep[detections.point_detection == 0]
+    assert detections.size[0, 2] == pytest.approx(np.ptp(own[:, 2]))
+    center, (length, width), _ = reference.min_area_rectangle(own[:, :2])
+    np.testing.assert_allclose(detections.center[0, :2], center, atol=0.1)
+    assert length * width <= detections.size[0, 0] * detections.size[0, 1] + 1e-4
+    np.testing.assert_allclose(detections.size[0, :2], [length, width], atol=0.15)
+
+
+DEGENERATE = {
+    "empty": np.zeros((0, 3)),
+    "one point": np.array([[5.0, 1.0, 0.0]]),
+    "all points equal": np.full((500, 3), 3.0),
+    "all NaN": np.full((50, 3), np.nan),
+    "out of range": np.full((50, 3), 500.0),
+    "all ground": np.random.default_rng(0).uniform([-30, -30, -1.71], [30, 30, -1.69], (5000, 3)),
+    "a wall": np.random.default_rng(0).uniform([9.99, -10, -1], [10.01, 10, 2], (5000, 3)),
+    "noise": np.random.default_rng(0).uniform(-20, 20, (5000, 3)),
+}
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_degenerate_sweeps_give_finite_boxes_and_account_for_every_point(name, preset):
+    sweep = DEGENERATE[name]
+    detections = reference.detect(sweep, DetectorConfig.presets()[preset])
+    fields = [field.name for field in dataclasses.fields(Counts)]
+    assert sorted(detections.counts) == sorted(fields)
+    assert sum(detections.counts[field] for field in fields[:NUM_POINT_COUNTS]) == len(sweep)
+    for array in (detections.center, detections.size, detections.yaw, detections.score):
+        assert np.isfinite(array).all()
+    assert detections.ground_mask.sum() == detections.counts["ground_points"]
+    assert np.bincount(detections.point_detection + 1, minlength=len(detections.score) + 1)[1:].tolist() == (
+        detections.num_points.tolist()
+    )
+
+
+def test_the_same_seed_gives_the_same_boxes():
+    first, second = (reference.detect(lidar_sweep(CARS), seed=3) for _ in range(2))
+    np.testing.assert_array_equal(first.center, second.center)
+    np.testing.assert_array_equal(first.score, second.score)
+
+
+def test_nan_points_change_nothing_but_their_count():
+    sweep = lidar_sweep(CARS)
+    clean, dirty = reference.detect(sweep), reference.detect(np.vstack([sweep, np.full((7, 3), np.nan)]))
+    np.testing.assert_array_equal(clean.center, dirty.center)
+    assert dirty.counts["nonfinite_points"] == 7
+    assert (dirty.point_component[-7:] == reference.NO_CLUSTER).all()
+
+
+@pytest.fixture(scope="module")
+def real_detections(data_root):
+    folder = data_root / "kitti_object" / "training"
+    xyz = np.fromfile(folder / "velodyne" / "000008.bin", np.float32).reshape(-1, 4)[:, :3]
+    return folder, xyz, reference.detect(xyz)
+
+
+def test_labelled_cars_of_a_real_sweep_are_found(real_detections):
+    folder, _, detections = real_detections
+    calibration = dict(
+        line.split(":", 1) for line in (folder / "calib" / "000008.txt").read_text().splitlines() if line
+    )
+    rect = np.array(calibration["R0_rect"].split(), float).reshape(3, 3)
+    velo = np.array(calibration["Tr_velo_to_cam"].split(), float).reshape(3, 4)
+    camera = detections.center @ (rect @ velo[:, :3]).T + rect @ velo[:, 3]
+    labels = [line.split() for line in (folder / "label_2" / "000008.txt").read_text().splitlines()]
+    cars = [np.array(label[11:14], float) for label in labels if label[0] == "Car"]
+    gaps = [np.hypot(*(camera[:, [0, 2]] - car[[0, 2]]).T).min() for car in cars]
+    assert len(cars) == 6
+    assert sum(gap < 0.5 for gap in gaps) >= 5
+
+
+def test_components_of_a_real_sweep_hold_each_detection_in_one_piece(real_detections):
+    _, xyz, detections = real_detections
+    obstacle = detections.point_component != reference.NO_CLUSTER
+    np.testing.assert_array_less(0.2, detections.height[obstacle])
+    best = detections.point_detection == 0
+    assert len(set(detections.point_component[best])) == 1
+    hull = detections.hulls[0].astype(np.float32)
+    for point in xyz[best, :2]:
+        assert cv2.pointPolygonTest(hull, point.tolist(), measureDist=True) > -1e-4
