@@ -162,6 +162,6 @@ def _with_lamps(color: np.ndarray, local: np.ndarray, size: tuple[float, float, 
     ends = np.abs(x) > size[0] / 2 - 0.22
     lamp = ends & (np.abs(y) > 0.3 * size[1]) & (np.abs(z - 0.62) < 0.09)
     color[lamp & (x > 0)] = (0.9, 0.9, 0.85)
-    color[lamp & (x < 0)] = (0.6, 0.02, 0.02)
+    color[lamp & (x < 0)] = (0.3, 0.0, 0.01)
     color[ends & (np.abs(y) < 0.26) & (np.abs(z - 0.45) < 0.06)] = (0.8, 0.8, 0.78)
     return color
