@@ -6,7 +6,7 @@ frame: x forward, y left, z up, metres.
 
 from jaxbox.viz.bird_eye import BirdEyeFrame, draw_bird_eye
 from jaxbox.viz.boxes import BoxSet
-from jaxbox.viz.canvas import read_image, save_png
+from jaxbox.viz.canvas import save_png
 from jaxbox.viz.colors import color_by_height, color_by_id
 from jaxbox.viz.image_boxes import draw_image_boxes
 from jaxbox.viz.lidar_view import LidarCamera, draw_lidar_view
@@ -25,7 +25,6 @@ __all__ = [
     "draw_stages",
     "plot_dimensions",
     "plot_residuals",
-    "read_image",
     "save_figure",
     "save_png",
 ]

@@ -2,12 +2,12 @@
 
 import os
 import pathlib
-import tempfile
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
+from jaxbox.io import atomic_path
 from jaxbox.viz.colors import BACKGROUND, INK, Color
 
 SHIFT = 4
@@ -72,9 +72,11 @@ def draw_text(
     picture: np.ndarray, text: str, position: Sequence[float], color: Color = INK, *, scale: float = 0.5
 ) -> None:
     """Draws one line of text in place with a dark edge, its lower left corner at a pixel."""
-    origin = (round(position[0]), round(position[1]))
-    cv2.putText(picture, text, origin, FONT, scale, BACKGROUND, 4, cv2.LINE_AA)
-    cv2.putText(picture, text, origin, FONT, scale, color, 1, cv2.LINE_AA)
+    column, row = round(position[0]), round(position[1])
+    # A thicker stroke would space the letters differently, so the edge is the same text, shifted.
+    for right, down in ((-1, 0), (1, 0), (0, -1), (0, 1), (1, 1)):
+        cv2.putText(picture, text, (column + right, row + down), FONT, scale, BACKGROUND, 1, cv2.LINE_AA)
+    cv2.putText(picture, text, (column, row), FONT, scale, color, 1, cv2.LINE_AA)
 
 
 def draw_legend(picture: np.ndarray, entries: Sequence[tuple[str, Color]], *, title: str = "") -> None:
@@ -88,23 +90,6 @@ def draw_legend(picture: np.ndarray, entries: Sequence[tuple[str, Color]], *, ti
         cv2.rectangle(picture, (16, row - 11), (34, row - 1), color, -1)
         draw_text(picture, text, (44, row))
         row += LINE_STEP_PX
-
-
-def write_atomically(path: pathlib.Path, content: bytes) -> None:
-    """Writes a file under a temporary name beside it, then renames: never half a file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        # mkstemp makes files that only their owner can read; give the usual permissions.
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
-        os.replace(temporary, path)
-    except BaseException:
-        pathlib.Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def save_png(path: str | os.PathLike[str], picture: np.ndarray) -> pathlib.Path:
@@ -126,26 +111,6 @@ def save_png(path: str | os.PathLike[str], picture: np.ndarray) -> pathlib.Path:
             f"the picture has shape {picture.shape} and type {picture.dtype}; it must be (h, w, 3) uint8."
         )
     _, encoded = cv2.imencode(".png", picture[..., ::-1])
-    path = pathlib.Path(path)
-    write_atomically(path, encoded.tobytes())
-    return path
-
-
-def read_image(path: str | os.PathLike[str]) -> np.ndarray:
-    """Reads a camera image.
-
-    Args:
-      path: a file of any format that OpenCV reads.
-
-    Returns:
-      (h, w, 3) uint8, red green blue.
-
-    Raises:
-      OSError: where the file is missing or cannot be read.
-      ValueError: where it is not an image.
-    """
-    content = np.frombuffer(pathlib.Path(path).read_bytes(), np.uint8)
-    image = cv2.imdecode(content, cv2.IMREAD_COLOR) if len(content) else None
-    if image is None:
-        raise ValueError(f"{path}: not a readable image ({len(content)} bytes); copy or download it again.")
-    return np.ascontiguousarray(image[..., ::-1])
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(encoded.tobytes())
+    return pathlib.Path(path)

@@ -34,27 +34,25 @@ def draw_image_boxes(
     """
     picture = np.ascontiguousarray(image).copy()
     box_colors, truth_colors = choose_colors(boxes, truth, judged)
-    in_view = _draw_set(picture, calibration, boxes, box_colors, thickness_px=2)
+    seen = _draw_set(picture, calibration, boxes, box_colors, thickness_px=2)
+    seen_truth: list[Color] = []
     if truth is not None:
-        _draw_set(picture, calibration, truth, truth_colors, thickness_px=1)
-    # Of what lies outside the image nothing is seen, so only what is drawn is counted.
-    seen_truth = [] if truth is None else truth_colors
-    seen = [color for color, shown in zip(box_colors, in_view, strict=True) if shown]
+        seen_truth = _draw_set(picture, calibration, truth, truth_colors, thickness_px=1)
     draw_legend(picture, legend_entries(seen, seen_truth), title=title)
     return picture
 
 
 def _draw_set(
     picture: np.ndarray, calibration: Calibration, boxes: BoxSet, colors: list[Color], *, thickness_px: int
-) -> list[bool]:
-    """Draws boxes, far ones first, and returns which have an edge in the picture."""
+) -> list[Color]:
+    """Draws boxes, far ones first, and returns the colours of those with an edge in the picture."""
     projection = np.asarray(calibration.P_rect, np.float64)
     segments = transform(boxes.segments(), np.asarray(calibration.T_rect_velo, np.float64))
-    shown = [False] * len(boxes)
+    shown = []
     for row in np.argsort(-segments[..., 2].mean(axis=(1, 2)), kind="stable"):
         uv = project(cut_segments(segments[row]), projection)
-        shown[row] = _meets_picture(uv, picture)
-        if shown[row]:
+        if _meets_picture(uv, picture):
+            shown.append(colors[row])
             draw_segments(picture, uv, colors[row], thickness_px=thickness_px)
             if boxes.captions:
                 _draw_caption(picture, uv, boxes.captions[row], colors[row])

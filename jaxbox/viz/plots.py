@@ -1,13 +1,12 @@
 """Plots of the evaluation with matplotlib, the ``plots`` extra (paper, figures 12 and 13)."""
 
-import io
 import os
 import pathlib
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxbox.viz.canvas import write_atomically
+from jaxbox.io import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -101,8 +100,6 @@ def plot_residuals(estimated: np.ndarray, true: np.ndarray, *, title: str = "") 
 
 def save_figure(path: str | os.PathLike[str], figure: "Figure") -> pathlib.Path:
     """Writes a figure as PNG, under a temporary name first, and returns the path."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=120)
-    path = pathlib.Path(path)
-    write_atomically(path, buffer.getvalue())
-    return path
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=120)
+    return pathlib.Path(path)

@@ -1,0 +1,5 @@
+"""The command line: ``jaxbox demo``, ``detect``, ``eval`` and ``info``."""
+
+from jaxbox.cli.app import app, main
+
+__all__ = ["app", "main"]

@@ -1,0 +1,133 @@
+"""The four commands and their options; the work is done in the module of each."""
+
+import pathlib
+from typing import Annotated
+
+import typer
+
+from jaxbox.cli.cache import enable_cache
+from jaxbox.cli.console import input_errors, stdout
+from jaxbox.cli.demo import run_demo
+from jaxbox.cli.detect import DetectOptions, ResultFormat, run_detect
+from jaxbox.cli.evaluate import run_eval
+from jaxbox.cli.info import print_info
+from jaxbox.config import DetectorConfig
+from jaxbox.io import InputError
+from jaxbox.version import __version__
+
+EXIT_CODES = (
+    "Exit codes: 0 all went well; 1 some sweeps failed, the others are done; "
+    "2 the input or an option cannot be used."
+)
+
+app = typer.Typer(
+    name="jaxbox",
+    help="Training-free LiDAR vehicle detection: sweeps in, oriented 3D boxes out.",
+    epilog=EXIT_CODES,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+
+def main() -> None:
+    """Runs the command line."""
+    app()
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        stdout().print(__version__)
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    enable_cache()
+
+
+@app.command(epilog=EXIT_CODES)
+def demo(
+    *,
+    output: Annotated[pathlib.Path, typer.Option(help="Folder for the pictures.")] = pathlib.Path("out"),
+    seed: Annotated[int, typer.Option(min=0, help="Of the scene: another number, another street.")] = 0,
+) -> None:
+    """Detect vehicles in a built-in ray-cast sweep and compare them with the exact truth."""
+    with input_errors():
+        run_demo(output, seed=seed, console=stdout())
+
+
+@app.command(epilog=EXIT_CODES)
+def detect(
+    path: Annotated[
+        pathlib.Path,
+        typer.Argument(help="A KITTI folder (object, raw or tracking), a folder of sweeps, or one sweep."),
+    ],
+    *,
+    output: Annotated[pathlib.Path, typer.Option(help="Folder for results and pictures.")],
+    preset: Annotated[
+        str, typer.Option(help="Settings: default, or paper for the paper's choices.")
+    ] = "default",
+    result_format: Annotated[
+        ResultFormat, typer.Option("--format", help="KITTI text files, one JSON Lines file, or both.")
+    ] = ResultFormat.KITTI,
+    capacity: Annotated[
+        int | None,
+        typer.Option(min=1, help="Points a sweep is padded to; by default what it needs. One compile each."),
+    ] = None,
+    min_score: Annotated[
+        float,
+        typer.Option(min=0.0, max=1.0, help="Leave out lower scores. 0 keeps all, as `eval` wants it."),
+    ] = 0.0,
+    pictures: Annotated[bool, typer.Option(help="Draw pictures of each sweep.")] = True,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only what went wrong.")] = False,
+) -> None:
+    """Detect vehicles in real sweeps: writes result files and pictures.
+
+    Results are OUTPUT/NAME.txt (KITTI) or OUTPUT/detections.jsonl (JSON Lines), pictures
+    OUTPUT/pictures/NAME_*.png. A broken sweep is reported and the others go on.
+    """
+    with input_errors():
+        if preset not in DetectorConfig.presets():
+            names = ", ".join(DetectorConfig.presets())
+            raise InputError(f"--preset {preset}: there is no such preset; choose one of {names}.")
+        options = DetectOptions(
+            output=output,
+            preset=preset,
+            result_format=result_format,
+            capacity=capacity,
+            min_score=min_score,
+            pictures=pictures,
+            quiet=quiet,
+        )
+        raise typer.Exit(run_detect(path, options))
+
+
+@app.command("eval", epilog=EXIT_CODES)
+def evaluate(
+    *,
+    labels: Annotated[pathlib.Path, typer.Option(help="The KITTI folder that was given to `detect`.")],
+    results: Annotated[pathlib.Path, typer.Option(help="The folder that `detect` wrote to.")],
+    json: Annotated[pathlib.Path | None, typer.Option(help="Also write every figure to this file.")] = None,
+    plots: Annotated[
+        pathlib.Path | None, typer.Option(help="Folder for the plots; needs the plots extra.")
+    ] = None,
+    missing_as_empty: Annotated[
+        bool, typer.Option("--missing-as-empty", help="Take a missing result file for one without boxes.")
+    ] = False,
+) -> None:
+    """Score results against labels: the paper's size errors, recall and precision, KITTI's AP."""
+    with input_errors():
+        run_eval(
+            labels, results, missing_as_empty=missing_as_empty, json_path=json, plots=plots, console=stdout()
+        )
+
+
+@app.command(epilog=EXIT_CODES)
+def info() -> None:
+    """Print versions, devices and presets."""
+    print_info(stdout())

@@ -1,0 +1,81 @@
+"""What goes to the terminal: results to stdout, progress and errors to stderr, and exit codes."""
+
+import contextlib
+import enum
+import sys
+from collections.abc import Iterator
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn
+from rich.progress import TimeRemainingColumn as _TimeLeft
+from rich.text import Text
+
+from jaxbox.io import InputError
+
+
+FILE_WIDTH = 120
+"""Columns of a table where stdout is no terminal: wide enough for all of them."""
+
+
+class ExitCode(enum.IntEnum):
+    """How a command ended."""
+
+    OK = 0
+    FRAME_FAILED = 1
+    BAD_INPUT = 2
+
+
+def stdout() -> Console:
+    """Console for results. Made when asked, so that a redirected stdout is honoured."""
+    width = None if sys.stdout.isatty() else FILE_WIDTH
+    return Console(highlight=False, soft_wrap=True, width=width)
+
+
+def stderr() -> Console:
+    """Console for progress and errors."""
+    return Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+def print_error(message: str) -> None:
+    """Prints one line to stderr, as it stands: a path may hold what looks like markup."""
+    stderr().print(Text.assemble(("error: ", "bold red"), message))
+
+
+@contextlib.contextmanager
+def input_errors() -> Iterator[None]:
+    """Turns errors that the user can mend into one line on stderr and exit code 2.
+
+    Raises:
+      typer.Exit: in place of a bad input, an unwritable folder or a missing extra.
+    """
+    try:
+        yield
+    except (InputError, OSError, ImportError) as error:
+        print_error(str(error))
+        raise typer.Exit(ExitCode.BAD_INPUT) from error
+
+
+class _Rate(ProgressColumn):
+    """Sweeps a second."""
+
+    def render(self, task: Task) -> Text:
+        """One number once there is one."""
+        return Text("" if task.speed is None else f"{task.speed:.1f}/s")
+
+
+def make_progress(*, shown: bool) -> Progress:
+    """A progress bar with rate and time left, on stderr; it hides where stderr is no terminal."""
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        _Rate(),
+        _TimeLeft(),
+        TextColumn("left"),
+        console=stderr(),
+        transient=True,
+        disable=not shown,
+        # Lines printed meanwhile go above the bar; where stdout is a file they must stay in it.
+        redirect_stdout=sys.stdout.isatty(),
+    )

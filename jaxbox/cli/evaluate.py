@@ -1,0 +1,154 @@
+"""``jaxbox eval``: the figures of a folder of results, as tables, JSON and plots."""
+
+import json
+import pathlib
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from jaxbox import viz
+from jaxbox.cli.report import make_table
+from jaxbox.evaluation import evaluate_folders
+from jaxbox.io import atomic_writer
+
+SELECTION_NAMES = {
+    "all": "every labelled car",
+    "easy_to_hard": "KITTI's easy to hard",
+    "easy_to_moderate": "KITTI's easy and moderate",
+    "clear": "at least 30 points, occlusion 0 or 1",
+}
+SIZE_SELECTION = "easy_to_hard"
+"""The cars whose median the constant row answers."""
+CUT_OVERLAP = 0.5
+"""The overlap of the rates by score that `evaluate_folders` reports."""
+METRIC_NAMES = {"image": "2D box", "orientation": "orientation", "bev": "bird's-eye view", "3d": "3D"}
+
+
+def run_eval(
+    labels: pathlib.Path,
+    results: pathlib.Path,
+    *,
+    missing_as_empty: bool,
+    json_path: pathlib.Path | None,
+    plots: pathlib.Path | None,
+    console: Console,
+) -> None:
+    """Measures results against labels, prints the tables, and writes what is asked for.
+
+    Args:
+      labels: folder of labelled sweeps.
+      results: folder of KITTI result files.
+      missing_as_empty: take a missing result file for an empty one.
+      json_path: file for every figure, or None.
+      plots: folder for the plots, or None.
+      console: where the tables go.
+
+    Raises:
+      InputError: where labels or results cannot be used.
+      ImportError: for plots without matplotlib.
+    """
+    report = evaluate_folders(labels, results, missing_as_empty=missing_as_empty)
+    print_report(report, console)
+    if json_path is not None:
+        with atomic_writer(json_path) as handle:
+            json.dump(report, handle, indent=1, allow_nan=False)
+        console.print(f"wrote {json_path}", markup=False)
+    if plots is not None:
+        objects = report["selections"][SIZE_SELECTION]["objects"]
+        for path in write_plots(objects, plots):
+            console.print(f"wrote {path}", markup=False)
+
+
+def print_report(report: Mapping[str, Any], console: Console) -> None:
+    """Prints what `evaluate_folders` measured: rates, sizes beside the constant, average precision."""
+    taken = report.get("num_missing_results", 0)
+    console.print(f"{report['num_frames']} labelled sweeps" + f", {taken} without results" * bool(taken))
+    console.print(recall_table(report["selections"]))
+    console.print(score_table(report["selections"]["all"]["rates_by_score"]))
+    matched = report["selections"][SIZE_SELECTION]["matched"]
+    console.print(size_table(matched))
+    yaw = matched["yaw"]
+    console.print(
+        f"mean BEV IoU {_number(matched['mean_bev_iou'])}, mean 3D IoU {_number(matched['mean_3d_iou'])}; "
+        f"yaw error median {_number(yaw['median_deg'], 1)}, p90 {_number(yaw['p90_deg'], 1)} degrees, "
+        f"{yaw['num_axis_swaps']} axis swaps"
+    )
+    console.print(precision_table(report["kitti"]["curves"]))
+
+
+def recall_table(selections: Mapping[str, Any]) -> Table:
+    """Recall of cars at BEV and 3D IoU 0.5 and 0.7, one row a selection."""
+    rows = []
+    for name, measured in selections.items():
+        rates = measured["rates"]
+        cells = [_number(rate["recall"]) for rate in rates]
+        rows.append([SELECTION_NAMES.get(name, name), str(rates[0]["num_labels"]), *cells])
+    some = next(iter(selections.values()))["rates"]
+    columns = ["cars", "labels", *(f"{rate['metric'].upper()} {rate['min_overlap']:g}" for rate in some)]
+    return make_table("recall of all boxes, whatever their score", columns, rows)
+
+
+def score_table(rates_by_score: Iterable[Mapping[str, Any]]) -> Table:
+    """Recall and precision over the least score, to choose where to cut."""
+    keys = ("recall", "precision")
+    rows = [
+        [f"{rate['min_score']:g}", *(_number(rate[key]) for key in keys), str(rate["num_false"])]
+        for rate in rates_by_score
+    ]
+    title = f"every labelled car at BEV IoU {CUT_OVERLAP:g}, by least score"
+    return make_table(title, ["score from", *keys, "false alarms"], rows)
+
+
+def size_table(matched: Mapping[str, Any]) -> Table:
+    """The paper's size errors, and the row of always answering the median car."""
+    rows = [_size_row(name, errors) for name, errors in matched["sizes"].items()]
+    if matched["constant_sizes"] is not None:
+        rows += [_size_row(f"constant: {name}", errors) for name, errors in matched["constant_sizes"].items()]
+    title = f"size of {matched['num']} matched cars (BEV IoU >= {matched['min_bev_iou']:g}), easy to hard"
+    columns = ["dimension", "MAE m", "RMSE m", "bias m", "error %", "Pearson", "1D IoU"]
+    return make_table(title, columns, rows)
+
+
+def _size_row(name: str, errors: Mapping[str, Any]) -> list[str]:
+    keys = (("mae", 3), ("rmse", 3), ("bias", 3), ("percent", 1), ("pearson", 3), ("mean_iou", 3))
+    return [name, *(_number(errors[key], digits) for key, digits in keys)]
+
+
+def precision_table(curves: Iterable[Mapping[str, Any]]) -> Table:
+    """KITTI's average precision over 40 recalls, and the most that perfect boxes reach on these sweeps."""
+    grouped: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
+    for curve in curves:
+        grouped.setdefault((curve["class"], curve["metric"]), {})[curve["difficulty"]] = curve
+    rows = []
+    for (class_name, metric), levels in grouped.items():
+        cells = [f"{curve['r40']:.2f} of {curve['ceiling_r40']:.2f}" for curve in levels.values()]
+        rows.append([f"{class_name}, {METRIC_NAMES.get(metric, metric)}", *cells])
+    difficulties = list(next(iter(grouped.values()))) if grouped else []
+    return make_table(
+        "KITTI average precision (R40) of its ceiling on these sweeps", ["", *difficulties], rows
+    )
+
+
+def write_plots(objects: Mapping[str, Any], folder: pathlib.Path) -> list[pathlib.Path]:
+    """Writes estimated against true dimensions (figure 12) and the residuals (figure 13).
+
+    Args:
+      objects: the matched boxes row by row, of `evaluate_folders`.
+      folder: where to.
+
+    Returns:
+      The files.
+    """
+    estimated = np.reshape(objects["estimated_m"], (-1, 3))
+    true = np.reshape(objects["true_m"], (-1, 3))
+    return [
+        viz.save_figure(folder / "dimensions.png", viz.plot_dimensions(estimated, true)),
+        viz.save_figure(folder / "residuals.png", viz.plot_residuals(estimated, true)),
+    ]
+
+
+def _number(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

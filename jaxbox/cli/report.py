@@ -1,0 +1,113 @@
+"""What the commands say about a sweep, a run and its boxes, in words and tables."""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from jaxbox.types import Detections, Label, Status
+
+SHOWN_MIN_SCORE = 0.2
+"""Boxes that score less are written but not drawn or counted as found: most of them are no vehicle."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FrameReport:
+    """One sweep that went through."""
+
+    name: str
+    """Name of the sweep."""
+    num_points: int
+    """Points of the sweep."""
+    detections: Detections
+    """What was found."""
+    detect_s: float
+    """Seconds in the detector, without compiling."""
+    other_s: float
+    """Seconds of reading, writing and drawing."""
+
+
+@dataclasses.dataclass
+class RunReport:
+    """All sweeps of a run."""
+
+    frames: list[FrameReport] = dataclasses.field(default_factory=list)
+    """Those that went through."""
+    failures: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+    """Name and reason of those that did not."""
+    without_camera: list[str] = dataclasses.field(default_factory=list)
+    """Names of those that KITTI text was asked for but that have no calibration."""
+    records: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    """What goes to the JSON Lines file."""
+
+
+def describe_frame(report: FrameReport, *, min_score: float = SHOWN_MIN_SCORE) -> list[str]:
+    """One line of counts and time, then one line a status bit.
+
+    Args:
+      report: the sweep.
+      min_score: boxes from this score on are counted by class.
+
+    Returns:
+      At least one line.
+    """
+    found = count_classes(report.detections, min_score=min_score)
+    total = int(np.asarray(report.detections.valid).sum())
+    line = (
+        f"{report.name}: {report.num_points} points, {found} of score >= {min_score:g} "
+        f"({total} in all), {report.detect_s * 1e3:.0f} ms"
+    )
+    return [line, *(f"  {text}" for text in Status(int(report.detections.status)).describe())]
+
+
+def count_classes(detections: Detections, *, min_score: float) -> str:
+    """Boxes a class, in words: '3 cars, 1 van', or 'no vehicle'."""
+    keep = np.asarray(detections.valid) & (np.asarray(detections.score) >= min_score)
+    counts = Counter(Label(label) for label in np.asarray(detections.label)[keep].tolist())
+    parts = [
+        f"{counts[label]} {label.name.lower()}{'s' * (counts[label] > 1)}" for label in Label if counts[label]
+    ]
+    return ", ".join(parts) or "no vehicle"
+
+
+def describe_run(run: RunReport, compile_s: dict[int, float]) -> list[str]:
+    """The summary: sweeps, times with compiling apart, and which status bits occurred how often.
+
+    Args:
+      run: what happened.
+      compile_s: seconds of compiling by capacity.
+
+    Returns:
+      A few lines.
+    """
+    lines = [f"{len(run.frames)} sweeps done, {len(run.failures)} failed"]
+    if compile_s:
+        parts = ", ".join(f"{seconds:.1f} s for {capacity} points" for capacity, seconds in compile_s.items())
+        lines.append(f"compiled (or loaded from the cache) once: {parts}")
+    if run.frames:
+        detect_ms = np.array([frame.detect_s for frame in run.frames]) * 1e3
+        other_ms = np.array([frame.other_s for frame in run.frames]) * 1e3
+        lines.append(
+            f"detector: median {np.median(detect_ms):.0f} ms, slowest {detect_ms.max():.0f} ms a sweep; "
+            f"reading, writing and drawing: median {np.median(other_ms):.0f} ms"
+        )
+    statuses = [Status(int(frame.detections.status)) for frame in run.frames]
+    for bit in Status:
+        count = sum(bit in status for status in statuses) if bit else 0
+        if count:
+            lines.append(f"{bit.name} in {count} of {len(statuses)} sweeps")
+    lines.extend(f"failed: {name}: {reason}" for name, reason in run.failures)
+    return lines
+
+
+def make_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
+    """A table whose first column is text and the others are numbers, to the right."""
+    table = Table(title=title, title_justify="left")
+    for index, column in enumerate(columns):
+        table.add_column(column, justify="left" if index == 0 else "right")
+    for row in rows:
+        table.add_row(*row)
+    return table
