@@ -39,6 +39,9 @@ IMAGE_SIZE_PX = (1242, 375)
 CAMERA = 2
 """The left colour camera, in whose image the object and tracking labels are."""
 
+RAW_CALIBRATION_FILES = ("calib_velo_to_cam.txt", "calib_cam_to_cam.txt")
+"""In a raw recording's folder of the day."""
+
 MIN_VISIBLE_FRACTION = 0.3
 """Boxes with less of their 2D box in the image are no answer: the labels hold what the image shows."""
 
@@ -269,8 +272,7 @@ def read_raw_calibration(
     Raises:
       InputError: as `read_calibration`.
     """
-    velo_path = pathlib.Path(folder) / "calib_velo_to_cam.txt"
-    cam_path = pathlib.Path(folder) / "calib_cam_to_cam.txt"
+    velo_path, cam_path = (pathlib.Path(folder) / name for name in RAW_CALIBRATION_FILES)
     velo, cam = _read_entries(velo_path), _read_entries(cam_path)
     rotation = _matrix(velo, ("R",), (3, 3), velo_path)
     translation = _matrix(velo, ("T",), (3, 1), velo_path)
@@ -353,7 +355,7 @@ def objects_from_detections(
     """
     center, size, yaw = detections.center, detections.size, detections.yaw
     image = _project_boxes(center, size, yaw, calibration)
-    keep = np.asarray(detections.valid & image.visible)
+    keep = np.array(detections.valid & image.visible)
     keep &= np.asarray(detections.score) >= min_score
     keep &= np.asarray(image.visible_fraction) >= min_visible_fraction
     location, rotation_y = _kitti_pose(np.asarray(center), np.asarray(size), np.asarray(yaw), calibration)
