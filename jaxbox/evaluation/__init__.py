@@ -3,11 +3,10 @@
 from jaxbox.evaluation.iou import paired_overlaps, pairwise_overlaps
 from jaxbox.evaluation.kitti import KittiEvaluation, PrecisionCurve, evaluate, soft_score
 from jaxbox.evaluation.matching import Selection, count_points_in_boxes
-from jaxbox.evaluation.report import SELECTIONS, evaluate_folders, evaluate_objects
+from jaxbox.evaluation.report import evaluate_folders, evaluate_objects
 from jaxbox.evaluation.sizes import DimensionErrors, constant_sizes, size_errors, yaw_errors
 
 __all__ = [
-    "SELECTIONS",
     "DimensionErrors",
     "KittiEvaluation",
     "PrecisionCurve",

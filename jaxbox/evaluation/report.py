@@ -52,7 +52,6 @@ def evaluate_folders(
 
     Raises:
       InputError: for a missing folder, no labelled sweep, a missing result file, or a bad line.
-
     """
     labelled = [
         (sweep, objects) for sweep in open_sweeps(root) if (objects := sweep.read_labels()) is not None
@@ -81,7 +80,8 @@ def _read_results(
     """Results of each frame; None where the file is missing."""
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder; give the one that `jaxbox detect` wrote to.")
-    if not any(folder.glob("*.txt")) and (folder / "data").is_dir():
+    # The official layout: results under data/, beside statistics that are text files too.
+    if not any((folder / f"{name}.txt").is_file() for name in names) and (folder / "data").is_dir():
         folder = folder / "data"
     files = {name: folder / f"{name}.txt" for name in names}
     missing = [name for name, file in files.items() if not file.is_file()]
