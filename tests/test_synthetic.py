@@ -32,6 +32,7 @@ from jaxbox.types import Calibration, Label
 SEEDS = range(4)
 GROUNDS = ("flat", "sloped", "uneven")
 TRUTH = Scene(make_terrain(np.random.default_rng(0)))
+quick_scan = functools.partial(scan, num_azimuths=500)
 CAR = Vehicle(Label.CAR, (15.0, 0.0), 0.3, (3.9, 1.63, 1.5), (0.5, 0.5, 0.5))
 sweep_of = functools.cache(functools.partial(make_sweep, num_azimuths=500))
 exact_sweep_of = functools.cache(functools.partial(make_sweep, num_azimuths=500, range_noise_m=0.0))
@@ -203,10 +204,10 @@ def test_nothing_opaque_stands_between_the_sensor_and_a_point(seed):
 
 def test_a_wall_in_front_of_a_car_leaves_it_no_point():
     wall = Thing(int(Clutter.WALL), (make_solid((8, -9, -2), (8.3, 9, 3), material=Material.WALL),))
-    alone = scan(dataclasses.replace(TRUTH, vehicles=(CAR,)))
-    hidden = scan(dataclasses.replace(TRUTH, vehicles=(CAR,), clutter=(wall,)))
+    alone = quick_scan(dataclasses.replace(TRUTH, vehicles=(CAR,)))
+    hidden = quick_scan(dataclasses.replace(TRUTH, vehicles=(CAR,), clutter=(wall,)))
     assert alone.boxes.visible[0] == 1
-    assert alone.boxes.num_points[0] > 500
+    assert alone.boxes.num_points[0] > 100
     assert hidden.boxes.visible[0] == 0
     assert hidden.boxes.num_points[0] == 0
     assert (hidden.object_id == Clutter.WALL).sum() > 1000
@@ -214,7 +215,7 @@ def test_a_wall_in_front_of_a_car_leaves_it_no_point():
 
 def test_a_wall_behind_a_car_hides_nothing_of_it():
     wall = Thing(int(Clutter.WALL), (make_solid((20, -9, -2), (20.3, 9, 3), material=Material.WALL),))
-    sweep = scan(dataclasses.replace(TRUTH, vehicles=(CAR,), clutter=(wall,)))
+    sweep = quick_scan(dataclasses.replace(TRUTH, vehicles=(CAR,), clutter=(wall,)))
     assert sweep.boxes.visible[0] == 1
 
 
@@ -269,7 +270,13 @@ def test_the_sensor_stands_at_its_height_above_the_ground(ground):
 @pytest.mark.parametrize(("slope_deg", "azimuth_deg"), [(0.0, 0.0), (3.0, 0.0), (-5.0, 0.0), (8.0, 60.0)])
 def test_a_plane_through_sloped_ground_has_the_slope_asked_for(slope_deg, azimuth_deg):
     sweep = make_sweep(
-        0, num_vehicles=0, clutter=False, ground="sloped", slope_deg=slope_deg, slope_azimuth_deg=azimuth_deg
+        0,
+        num_vehicles=0,
+        clutter=False,
+        num_azimuths=500,
+        ground="sloped",
+        slope_deg=slope_deg,
+        slope_azimuth_deg=azimuth_deg,
     )
     x, y, z = sweep.xyz.astype(np.float64).T
     a, b, c = np.linalg.lstsq(np.column_stack([x, y, np.ones_like(x)]), z, rcond=None)[0]
@@ -278,7 +285,7 @@ def test_a_plane_through_sloped_ground_has_the_slope_asked_for(slope_deg, azimut
     assert c == pytest.approx(-1.73, abs=5e-3)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", [0, 1])
 def test_uneven_ground_is_no_plane(seed):
     x, y, z = ground_only_sweep(seed, ground="uneven").xyz.astype(np.float64).T
     system = np.column_stack([x, y, np.ones_like(x)])
@@ -314,7 +321,7 @@ def test_beams_span_the_sensor_s_field_of_view_from_the_top():
 
 @pytest.mark.parametrize("noise_m", [0.005, 0.02, 0.05])
 def test_range_noise_has_the_stated_deviation_and_no_bias(noise_m):
-    sweep = make_sweep(0, num_vehicles=0, clutter=False, range_noise_m=noise_m)
+    sweep = make_sweep(0, num_vehicles=0, clutter=False, num_azimuths=1000, range_noise_m=noise_m)
     measured = np.linalg.norm(sweep.xyz.astype(np.float64), axis=1)
     # The direction is exact, so the true range to flat ground follows from it.
     true = 1.73 / -(sweep.xyz[:, 2] / measured)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import enum
+import math
 
 import numpy as np
 
@@ -195,7 +196,9 @@ def _has_room(vehicle: Vehicle, others: list[Vehicle], *, may_hide: bool) -> boo
     """Whether a vehicle is in reach, apart from all others, and, unless it may, hides none of them."""
     if not MIN_RANGE_M <= np.hypot(*vehicle.xy) <= MAX_RANGE_M:
         return False
-    if not all(_apart(outline(vehicle), outline(other)) for other in others):
+    reach = math.hypot(*vehicle.size[:2]) / 2 + SPACING_M
+    close = [o for o in others if math.dist(o.xy, vehicle.xy) < reach + math.hypot(*o.size[:2]) / 2]
+    if not all(_apart(outline(vehicle), outline(other)) for other in close):
         return False
     return may_hide or not any(_hides(vehicle, other) or _hides(other, vehicle) for other in others)
 
