@@ -472,6 +472,23 @@ def test_ray_shares_sum_to_one_and_a_mirrored_sweep_gives_mirrored_shares():
     assert np.std(shares[0], axis=1).min() > 0.01
 
 
+def test_the_share_of_hit_rays_is_the_share_of_the_span_that_holds_returns():
+    box = np.array([[-12.0, 0.4, 4.0, 1.6, 0.5]])
+    corners = turned(np.array([[2, 0.8], [-2, 0.8], [-2, -0.8], [2, -0.8]]), 0.5) + box[0, :2]
+    # The box lies across the cut of the azimuths: measured from -x there is none.
+    span = np.arctan2(-corners[:, 1], -corners[:, 0])
+    middle = np.arctan2(-0.4, 12.0)
+    azimuth = np.pi + np.linspace(middle, span.max(), 2000)
+    faces = [rho * np.array([np.cos(azimuth), np.sin(azimuth)]) for rho in np.arange(9.5, 14.5, 0.1)]
+    xy = np.concatenate(faces, axis=1).T
+    xyz = np.column_stack([xy, np.full(len(xy), 0.6)])
+    evidence = reference.build_evidence(xyz, xyz[:, 2], sensor_height_m=0.0, **EVIDENCE)
+    share = (span.max() - middle) / np.ptp(span)
+    assert abs(share - 0.5) > 0.02
+    rays = reference.box_evidence(box, evidence, num_rays=400)
+    assert rays.hit[0] == pytest.approx(share, abs=0.015)
+
+
 def test_without_evidence_every_ray_counts_as_hit():
     rays = reference.box_evidence(np.ones((3, 5)), None, num_rays=8)
     assert rays.hit.tolist() == [1, 1, 1]
@@ -546,6 +563,39 @@ def test_evidence_turns_a_rear_face_into_a_car_that_points_away_from_the_sensor(
     np.testing.assert_allclose(completed.box[:2], [14.0, 2.0], atol=0.1)
     assert np.cos(completed.box[4]) ** 2 == pytest.approx(1)
     assert completed.objective > 2.4
+
+
+def test_the_chosen_hypothesis_has_the_objective_that_its_parts_add_up_to():
+    xyz = lidar_sweep([(14.0, 2.0, 3.9, 1.2, 0.4, 1.5), (9.0, 2.9, 0.3, 1.0, 0.0, 1.0)])
+    height = xyz[:, 2] + SENSOR_HEIGHT_M
+    evidence = reference.build_evidence(xyz, height, sensor_height_m=SENSOR_HEIGHT_M, **EVIDENCE)
+    xy = xyz[(height > 0.2) & (height < 0.8) & (xyz[:, 0] > 10), :2]
+    curve, extents = reference.criterion_curve(
+        xy, criterion="visible_closeness", num_angles=90, min_distance_m=0.05
+    )
+    weights = {"free_weight": 0.7, "free_length_weight": 3.0, "inside_weight": 0.4, "near_weight": 0.9}
+    boxes = {}
+    for cost in (-9.0, 9.0):
+        changes = weights | {"closeness_weight": 1.3, "not_away_cost": cost, "length_m": 6.0, "width_m": 2.2}
+        completed = reference.complete_box(
+            xy,
+            extents[23],
+            angle=np.radians(23),
+            criterion_value=curve[23],
+            evidence=evidence,
+            mode="evidence",
+            **(COMPLETE | changes),
+        )
+        rays = reference.box_evidence(completed.box[None], evidence, num_rays=COMPLETE["num_rays"])
+        inside, near = reference.point_agreement(completed.box[None], xy)
+        parts = (
+            rays.hit - 0.7 * rays.free - 3 * rays.free_length + 0.4 * inside + 0.9 * near + 1.3 * curve[23]
+        )
+        assert completed.objective == pytest.approx(parts[0] - min(cost, 0))
+        assert min(rays.hit[0], rays.free[0], rays.free_length[0]) > 0
+        boxes[cost] = completed.box
+    # A high cost leaves only the placement that grows away from the sensor, a gain only the others.
+    assert np.hypot(*boxes[9.0][:2]) > np.hypot(*boxes[-9.0][:2]) + 0.05
 
 
 def test_points_on_the_visible_faces_agree_fully_and_points_behind_agree_less():
@@ -662,9 +712,14 @@ CARS = [
 ]
 
 
-def test_cars_on_flat_ground_are_found_where_they_stand():
+@pytest.fixture(scope="module")
+def car_scene():
     sweep = lidar_sweep(CARS)
-    detections = reference.detect(sweep)
+    return sweep, reference.detect(sweep)
+
+
+def test_cars_on_flat_ground_are_found_where_they_stand(car_scene):
+    sweep, detections = car_scene
     assert detections.found
     np.testing.assert_allclose(detections.coefficients, [0, 0, -SENSOR_HEIGHT_M], atol=0.02)
     for x, y, length, width, yaw, height in CARS:
@@ -680,12 +735,23 @@ def test_cars_on_flat_ground_are_found_where_they_stand():
         assert outside.max() < 0.25
 
 
-def test_a_sweep_turned_half_round_gives_boxes_turned_half_round():
-    first = reference.detect(lidar_sweep(CARS))
-    second = reference.detect(lidar_sweep(CARS) * [-1, -1, 1])
-    for detections, other, sign in ((first, second, -1), (second, first, -1)):
+def test_a_truck_is_called_a_truck_and_a_car_is_not():
+    truck = (28.0, 6.0, 10.8, 2.6, -0.3, 3.3)
+    detections = reference.detect(lidar_sweep([truck, CARS[1]]))
+    for label, body in ((Label.TRUCK, truck), (Label.CAR, CARS[1])):
+        row = np.argmin(np.hypot(*(detections.center[:, :2] - body[:2]).T))
+        assert detections.label[row] == label
+        np.testing.assert_allclose(detections.center[row, :2], body[:2], atol=0.5)
+        np.testing.assert_allclose(detections.size[row, :2], body[2:4], atol=0.2)
+
+
+def test_a_sweep_turned_half_round_gives_boxes_turned_half_round(car_scene):
+    sweep, first = car_scene
+    second = reference.detect(sweep * [-1, -1, 1])
+    for detections, other in ((first, second), (second, first)):
+        assert (detections.score > 0.3).sum() >= len(CARS)
         for center in detections.center[detections.score > 0.3]:
-            gap = np.linalg.norm(other.center - center * [sign, sign, 1], axis=1)
+            gap = np.linalg.norm(other.center - center * [-1, -1, 1], axis=1)
             assert gap.min() < 0.1
 
 
@@ -728,15 +794,16 @@ def test_degenerate_sweeps_give_finite_boxes_and_account_for_every_point(name, p
     )
 
 
-def test_the_same_seed_gives_the_same_boxes():
-    first, second = (reference.detect(lidar_sweep(CARS), seed=3) for _ in range(2))
+def test_the_same_seed_gives_the_same_boxes(car_scene):
+    sweep, first = car_scene
+    second = reference.detect(sweep, seed=0)
     np.testing.assert_array_equal(first.center, second.center)
     np.testing.assert_array_equal(first.score, second.score)
 
 
-def test_nan_points_change_nothing_but_their_count():
-    sweep = lidar_sweep(CARS)
-    clean, dirty = reference.detect(sweep), reference.detect(np.vstack([sweep, np.full((7, 3), np.nan)]))
+def test_nan_points_change_nothing_but_their_count(car_scene):
+    sweep, clean = car_scene
+    dirty = reference.detect(np.vstack([sweep, np.full((7, 3), np.nan)]))
     np.testing.assert_array_equal(clean.center, dirty.center)
     assert dirty.counts["nonfinite_points"] == 7
     assert (dirty.point_component[-7:] == reference.NO_CLUSTER).all()
