@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox.geometry import wrap_yaw
 from jaxbox.io._files import InputError, atomic_writer, read_text
 from jaxbox.projection import check_full_rank, compose_transforms, project_boxes, rigid_transform
 from jaxbox.types import Calibration, Detections, Label
@@ -428,8 +427,13 @@ def boxes_from_objects(
     x, y = np.linalg.solve(_ground_axes(T_rect_velo), np.stack([np.cos(rotation_y), -np.sin(rotation_y)]))
     across = size[:, 1] > size[:, 0]
     size[across, :2] = size[across, 1::-1]
-    yaw = wrap_yaw(jnp.asarray(np.arctan2(y, x) + across * np.pi / 2))
-    return center, size, np.asarray(yaw, np.float64)
+    return center, size, _wrap_yaw(np.arctan2(y, x) + across * np.pi / 2)
+
+
+def _wrap_yaw(yaw: np.ndarray) -> np.ndarray:
+    """`jaxbox.geometry.wrap_yaw` in NumPy: under JAX every new number of labels would compile anew."""
+    wrapped = yaw - np.pi * np.floor(yaw / np.pi + 0.5)
+    return np.where(wrapped >= np.pi / 2, -np.pi / 2, wrapped)
 
 
 def observation_angle(rotation_y: float, location: np.ndarray) -> float:

@@ -23,13 +23,14 @@ from jaxbox.io._files import InputError
 from jaxbox.io.images import read_image
 from jaxbox.io.kitti import (
     IMAGE_SIZE_PX,
+    RAW_CALIBRATION_FILES,
     KittiObject,
     read_calibration,
     read_labels,
     read_raw_calibration,
     tracking_name,
 )
-from jaxbox.io.points import POINT_SUFFIXES, read_points
+from jaxbox.io.points import POINT_SUFFIXES, TEXT_SUFFIXES, read_points
 from jaxbox.types import Calibration
 
 _FOLDERS = (
@@ -133,32 +134,35 @@ def open_sweeps(path: str | os.PathLike[str]) -> tuple[Sweep, ...]:
         return (_sweep_at(path),)
     if not path.is_dir():
         raise InputError(f"{path}: there is no such file or folder; check the path.")
-    for folders in _candidate_folders(path):
-        if files := _point_files(folders):
-            return tuple(_sweep_at(file) for file in files)
+    if files := _find_points(path):
+        return tuple(_sweep_at(file) for file in files)
     raise InputError(
         f"{path}: no points there. Give a point file ({', '.join(POINT_SUFFIXES)}), a folder of them, or a "
         f"folder that holds {', '.join(_SEARCHED)}."
     )
 
 
-def _candidate_folders(path: pathlib.Path) -> Iterator[list[pathlib.Path]]:
-    """Sets of folders that may hold the points, likeliest first; the first with any points is taken."""
-    yield [path]
+def _find_points(path: pathlib.Path) -> list[pathlib.Path]:
+    """The point files of the first place that has any, all of one kind."""
+    layouts = list(_layout_folders(path))
+    # Binary points are taken where they lie, but .txt files beside a known layout are its calibration.
+    searches = [(suffix, folders) for suffix in TEXT_SUFFIXES for folders in [*layouts, [path]]]
+    searches = [(".bin", folders) for folders in [[path], *layouts]] + searches
+    return next((files for search in searches if (files := _point_files(*search))), [])
+
+
+def _layout_folders(path: pathlib.Path) -> Iterator[list[pathlib.Path]]:
+    """Sets of folders that may hold the points, by layout."""
     for pattern in _FOLDERS:
         # Any subfolder of "velodyne" is a sequence; elsewhere it could be anything, such as labels.
         if pattern != "*" or path.name == "velodyne":
             yield sorted(folder for folder in path.glob(pattern) if folder.is_dir())
 
 
-def _point_files(folders: list[pathlib.Path]) -> list[pathlib.Path]:
-    """The point files of one kind: a folder may hold notes beside its points."""
-    for suffix in POINT_SUFFIXES:
-        files = [file for folder in folders for file in sorted(folder.glob(f"*{suffix}"))]
-        # Hidden files are other programs' leftovers.
-        if files := [file for file in files if not file.name.startswith(".")]:
-            return files
-    return []
+def _point_files(suffix: str, folders: list[pathlib.Path]) -> list[pathlib.Path]:
+    files = [file for folder in folders for file in sorted(folder.glob(f"*{suffix}"))]
+    # Hidden files are other programs' leftovers.
+    return [file for file in files if not file.name.startswith(".")]
 
 
 def _sweep_at(file: pathlib.Path) -> Sweep:
@@ -195,7 +199,8 @@ def _tracking_sweep(file: pathlib.Path, root: pathlib.Path) -> Sweep:
 
 
 def _raw_sweep(file: pathlib.Path, drive: pathlib.Path) -> Sweep:
-    calibrated = (drive.parent / "calib_velo_to_cam.txt").is_file()
+    # One of the two alone is a mistake, which reading them will name.
+    calibrated = any((drive.parent / name).is_file() for name in RAW_CALIBRATION_FILES)
     return Sweep(
         name=f"{drive.name}_{file.stem}",
         points_path=file,
