@@ -3,9 +3,19 @@
 import os
 import pathlib
 
+import jax
 import pytest
 
 DATA = pathlib.Path(os.environ.get("JAXBOX_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keeps compiled functions in pytest's cache: the notebook's kernel and the next run share them.
+
+    `pytest --cache-clear` starts from nothing.
+    """
+    folder = os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(config.cache.mkdir("jax")))
+    jax.config.update("jax_compilation_cache_dir", folder)
 
 
 @pytest.fixture(scope="session")

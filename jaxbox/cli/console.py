@@ -13,7 +13,6 @@ from rich.text import Text
 
 from jaxbox.io import InputError
 
-
 FILE_WIDTH = 120
 """Columns of a table where stdout is no terminal: wide enough for all of them."""
 

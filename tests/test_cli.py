@@ -1,0 +1,304 @@
+"""The command line: exit codes, files, one broken sweep among others, and what is printed."""
+
+import dataclasses
+import functools
+import json
+import pathlib
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import jaxbox
+from jaxbox import synthetic
+from jaxbox.cli import app, cache, demo
+from jaxbox.cli.report import FrameReport, RunReport, describe_frame, describe_run
+from jaxbox.config import DetectorConfig
+from jaxbox.io import objects_from_detections, read_image, read_jsonl, read_labels, write_bin, write_labels
+from jaxbox.types import PointCloud, Status
+
+# Few beams, so that all sweeps of this file share the smallest capacity and one compile.
+CAPACITY = 16384
+make_small_sweep = functools.partial(synthetic.make_sweep, num_azimuths=250)
+
+
+@pytest.fixture(autouse=True)
+def _no_user_cache(monkeypatch):
+    """The tests leave the user's cache folder and JAX's settings alone."""
+    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
+
+
+def run(*arguments):
+    """Runs a command in this process, so that the compiled detector is shared."""
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def calibration_text(calibration):
+    """A KITTI calibration file whose rectification is the identity."""
+    rows = {
+        "P2": np.asarray(calibration.P_rect),
+        "R0_rect": np.eye(3),
+        "Tr_velo_to_cam": np.asarray(calibration.T_rect_velo)[:3],
+    }
+    return "".join(f"{key}: {' '.join(f'{v:.9e}' for v in value.ravel())}\n" for key, value in rows.items())
+
+
+def write_points(path, sweep):
+    write_bin(path, sweep.xyz, sweep.intensity)
+
+
+@pytest.fixture(scope="session")
+def kitti_folder(tmp_path_factory):
+    """Two synthetic sweeps in KITTI's object layout; their detections are their labels."""
+
+    root = tmp_path_factory.mktemp("kitti") / "training"
+    for folder in ("velodyne", "calib", "label_2"):
+        (root / folder).mkdir(parents=True)
+    for seed in range(2):
+        sweep = make_small_sweep(seed)
+        write_points(root / "velodyne" / f"{seed:06d}.bin", sweep)
+        (root / "calib" / f"{seed:06d}.txt").write_text(calibration_text(sweep.calibration))
+        cloud = PointCloud.from_numpy(sweep.xyz, sweep.intensity)
+        assert cloud.capacity == CAPACITY
+        objects = objects_from_detections(jaxbox.detect(cloud, DetectorConfig()), sweep.calibration)
+        labels = [dataclasses.replace(item, truncation=0, occlusion=0, score=None) for item in objects]
+        write_labels(root / "label_2" / f"{seed:06d}.txt", labels)
+    return root
+
+
+@pytest.fixture(scope="session")
+def detected(kitti_folder, tmp_path_factory):
+    """The two sweeps after `jaxbox detect`, with everything it writes."""
+    output = tmp_path_factory.mktemp("detected")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(cache.CACHE_VARIABLE, "")
+        result = run("detect", kitti_folder, "--output", output, "--format", "both")
+    assert result.exit_code == 0, result.output
+    return output, result
+
+
+def test_detect_writes_a_result_file_and_pictures_a_sweep(detected):
+    output, _ = detected
+    names = sorted(str(path.relative_to(output)) for path in output.rglob("*") if path.is_file())
+    expected = ["detections.jsonl"]
+    for name in ("000000", "000001"):
+        expected += [f"{name}.txt", f"pictures/{name}_boxes.png", f"pictures/{name}_lidar.png"]
+    assert names == sorted(expected)
+    assert read_image(output / "pictures" / "000000_boxes.png").shape == (720, 1200, 3)
+
+
+def test_both_formats_hold_the_same_boxes(detected):
+    output, _ = detected
+    for record in read_jsonl(output / "detections.jsonl"):
+        lines = read_labels(output / f"{record['name']}.txt")
+        scores = {round(box["score"], 5) for box in record["boxes"]}
+        assert lines, "a street has vehicles"
+        assert {round(line.score, 5) for line in lines} <= scores, "the camera sees some of them"
+
+
+def test_detect_prints_counts_a_sweep_and_a_summary_with_compiling_apart(detected):
+    _, result = detected
+    lines = result.stdout.splitlines()
+    assert [line.split(":")[0] for line in lines if line.startswith("00000")] == ["000000", "000001"]
+    assert "2 sweeps done, 0 failed" in result.stdout
+    assert "compiled (or loaded from the cache) once:" in result.stdout
+    assert f"for {CAPACITY} points" in result.stdout
+    assert "detector: median" in result.stdout
+
+
+def test_eval_of_results_against_themselves_finds_every_car(kitti_folder, detected, tmp_path):
+    output, _ = detected
+    result = run(
+        "eval", "--labels", kitti_folder, "--results", output,
+        "--json", tmp_path / "eval.json", "--plots", tmp_path / "plots",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    report = json.loads((tmp_path / "eval.json").read_text())
+    cars = report["selections"]["all"]
+    assert cars["rates"][0]["num_labels"] > 0
+    assert [rate["recall"] for rate in cars["rates"]] == [1.0] * 4
+    assert cars["matched"]["sizes"]["pooled"]["mae"] == pytest.approx(0, abs=1e-6)
+    for text in ("constant: pooled", "Pearson", "1D IoU", "3D 0.7", "R40"):
+        assert text in result.stdout
+    assert sorted(path.name for path in (tmp_path / "plots").iterdir()) == ["dimensions.png", "residuals.png"]
+
+
+def test_eval_says_which_result_is_missing_and_can_take_it_for_empty(kitti_folder, detected, tmp_path):
+    results = tmp_path / "results"
+    results.mkdir()
+    shutil.copy(detected[0] / "000000.txt", results)
+    arguments = ("eval", "--labels", kitti_folder, "--results", results)
+    missing = run(*arguments)
+    assert missing.exit_code == 2
+    assert "000001.txt" in missing.stderr
+    taken = run(*arguments, "--missing-as-empty")
+    assert taken.exit_code == 0, taken.output
+    assert "1 without results" in taken.stdout
+
+
+def test_one_broken_sweep_is_reported_and_the_others_are_done(kitti_folder, tmp_path):
+    root = tmp_path / "training"
+    shutil.copytree(kitti_folder, root)
+    (root / "velodyne" / "000000.bin").write_bytes(b"\0" * 17)
+    output = tmp_path / "out"
+    result = run("detect", root, "--output", output, "--no-pictures")
+    assert result.exit_code == 1
+    assert "000000.bin" in result.stderr
+    assert "16" in result.stderr
+    assert "1 sweeps done, 1 failed" in result.stdout
+    assert [path.name for path in output.iterdir()] == ["000001.txt"]
+
+
+def test_a_broken_sweep_leaves_an_earlier_result_whole(kitti_folder, detected, tmp_path):
+    root = tmp_path / "training"
+    shutil.copytree(kitti_folder, root)
+    (root / "calib" / "000000.txt").write_text("P2: 1 2 3\n")
+    output = tmp_path / "out"
+    output.mkdir()
+    shutil.copy(detected[0] / "000000.txt", output)
+    before = (output / "000000.txt").read_bytes()
+    result = run("detect", root / "velodyne" / "000000.bin", "--output", output, "--quiet")
+    assert result.exit_code == 1
+    assert "000000.txt" in result.stderr
+    assert result.stdout == ""
+    assert (output / "000000.txt").read_bytes() == before
+
+
+def test_a_broken_image_is_reported_with_its_file(kitti_folder, tmp_path):
+    root = tmp_path / "training"
+    shutil.copytree(kitti_folder, root)
+    (root / "image_2").mkdir()
+    (root / "image_2" / "000000.png").write_bytes(b"no image")
+    result = run("detect", root, "--output", tmp_path / "out", "--no-pictures")
+    assert result.exit_code == 1
+    assert "image_2/000000.png: not a readable image" in result.stderr
+
+
+def test_sweeps_without_a_camera_are_written_as_json_lines(tmp_path):
+    for seed in range(2):
+        write_points(tmp_path / "sweeps" / f"{seed}.bin", make_small_sweep(seed))
+    output = tmp_path / "out"
+    result = run("detect", tmp_path / "sweeps", "--output", output, "--no-pictures", "--min-score", "0.01")
+    assert result.exit_code == 0, result.output
+    assert "no camera calibration" in result.stderr
+    assert [path.name for path in output.iterdir()] == ["detections.jsonl"]
+    records = read_jsonl(output / "detections.jsonl")
+    scores = [box["score"] for record in records for box in record["boxes"]]
+    assert [record["name"] for record in records] == ["0", "1"]
+    assert len(scores) > 0
+    assert min(scores) >= 0.01
+
+
+def test_an_empty_sweep_is_no_failure_and_its_status_is_in_words(tmp_path):
+    (tmp_path / "empty.bin").write_bytes(b"")
+    result = run("detect", tmp_path / "empty.bin", "--output", tmp_path / "out")
+    assert result.exit_code == 0, result.output
+    assert "EMPTY: no finite point" in result.stdout
+    assert "EMPTY in 1 of 1 sweeps" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("detect", "{tmp}/nowhere", "--output", "{tmp}/out"), "nowhere"),
+        (("detect", "{tmp}", "--output", "{tmp}/out"), "no points"),
+        (("detect", "{tmp}", "--output", "{tmp}/out", "--preset", "best"), "choose one of default, paper"),
+        (("detect", "{tmp}", "--output", "{tmp}/out", "--format", "xml"), "xml"),
+        (("detect", "{tmp}", "--output", "{tmp}/out", "--min-score", "2"), "min-score"),
+        (("detect", "{tmp}", "--output", "{tmp}/out", "--capacity", "0"), "capacity"),
+        (("detect", "{tmp}"), "output"),
+        (("eval", "--labels", "{tmp}/nowhere", "--results", "{tmp}"), "nowhere"),
+        (("unknown",), "unknown"),
+    ],
+)
+def test_bad_input_ends_with_exit_code_2_and_no_traceback(tmp_path, arguments, expected):
+    result = run(*(argument.format(tmp=tmp_path) for argument in arguments))
+    assert result.exit_code == 2
+    assert expected in result.stderr
+    assert "Traceback" not in result.output
+    assert isinstance(result.exception, SystemExit)
+
+
+def test_an_output_that_cannot_be_made_ends_with_exit_code_2(kitti_folder, tmp_path):
+    (tmp_path / "file").write_text("")
+    result = run("detect", kitti_folder, "--output", tmp_path / "file")
+    assert result.exit_code == 2
+    assert str(tmp_path / "file") in result.stderr
+
+
+def test_plots_without_matplotlib_name_the_extra(kitti_folder, detected, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    result = run("eval", "--labels", kitti_folder, "--results", detected[0], "--plots", tmp_path)
+    assert result.exit_code == 2
+    assert "pip install 'jaxbox[plots]'" in result.stderr
+
+
+@pytest.mark.parametrize("command", ["demo", "detect", "eval", "info"])
+def test_every_help_states_the_exit_codes(command):
+    result = run(command, "--help")
+    assert result.exit_code == 0
+    assert "Exit codes: 0" in result.stdout
+
+
+def test_info_names_versions_devices_and_presets(monkeypatch):
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    result = run("info")
+    assert result.exit_code == 0
+    for text in ("jaxbox", "devices: ", "default", "paper", "not kept"):
+        assert text in result.stdout
+
+
+def test_demo_writes_a_picture_a_stage_and_compares_every_vehicle(tmp_path, monkeypatch):
+    monkeypatch.setattr(demo, "make_sweep", make_small_sweep)
+    result = run("demo", "--output", tmp_path, "--seed", "1")
+    assert result.exit_code == 0, result.output
+    names = [path.name for path in sorted(tmp_path.iterdir())]
+    stages = ("sweep", "no_ground", "clusters", "hulls", "boxes", "lidar", "image")
+    assert names == [f"{number}_{stage}.png" for number, stage in enumerate(stages, start=1)]
+    rows = [line for line in result.stdout.splitlines() if " m " in line and "│" in line]
+    assert len(rows) == demo.NUM_VEHICLES
+
+
+def test_a_table_of_perfect_boxes_has_no_errors():
+    sweep = make_small_sweep(3)
+    truth = sweep.boxes
+    boxes = demo.BoxSet(
+        center=truth.center, size=truth.size, yaw=truth.yaw, captions=tuple("x" for _ in range(len(truth)))
+    )
+    table = demo.compare_with_truth(boxes, sweep)
+    cells = {column.header: list(column.cells) for column in table.columns}
+    assert set(cells["length"]) == {"+0.00"}
+    assert set(cells["yaw"]) == {"+0.0"}
+    assert set(cells["BEV IoU"]) == {"1.00"}
+
+
+def test_the_module_runs_as_a_program_and_prints_its_version():
+    command = [sys.executable, "-m", "jaxbox", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "0.1.0"
+
+
+def test_every_status_bit_is_described_for_a_sweep_and_counted_for_a_run(kitti_folder):
+
+    cloud = PointCloud.from_numpy(np.zeros((0, 3)), capacity=CAPACITY)
+    every = Status(sum(Status))
+    detections = dataclasses.replace(jaxbox.detect(cloud, DetectorConfig()), status=np.int32(every))
+    frame = FrameReport(name="a", num_points=0, detections=detections, detect_s=0.1, other_s=0.1)
+    lines = describe_frame(frame)
+    assert len(lines) == 1 + len([bit for bit in Status if bit])
+    summary = "\n".join(describe_run(RunReport(frames=[frame], failures=[("b", "why")]), {}))
+    assert all(f"{bit.name} in 1 of 1 sweeps" in summary for bit in Status if bit)
+    assert "failed: b: why" in summary
+
+
+def test_the_cache_folder_follows_the_environment():
+    home = pathlib.Path.home()
+    assert cache.cache_folder({}) == home / ".cache" / "jaxbox"
+    assert cache.cache_folder({"XDG_CACHE_HOME": "/x"}) == pathlib.Path("/x/jaxbox")
+    assert cache.cache_folder({"XDG_CACHE_HOME": "/x", "JAXBOX_CACHE_DIR": "/y"}) == pathlib.Path("/y")
+    assert cache.enable_cache({"JAXBOX_CACHE_DIR": ""}) is None
+    assert cache.enable_cache({"JAXBOX_CACHE_DIR": "/proc/no/such"}) is None
+    assert cache.enable_cache({"JAX_COMPILATION_CACHE_DIR": "/z"}) == pathlib.Path("/z")
