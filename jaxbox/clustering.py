@@ -112,8 +112,8 @@ class _CellSet:
         slots = self.num_words * WORD_BITS
         flat = jnp.where(member, self._flat(index), slots)
         flags = jnp.zeros(slots, jnp.uint8).at[flat].set(1, mode="drop")
-        rows = flags.reshape(WORD_BITS, self.num_words)
-        self.words = sum(rows[bit].astype(jnp.uint32) << bit for bit in range(WORD_BITS))
+        rows = flags.reshape(WORD_BITS, self.num_words).astype(jnp.uint32)
+        self.words = jnp.sum(rows << jnp.arange(WORD_BITS, dtype=jnp.uint32)[:, None], axis=0, dtype=jnp.uint32)
         population = jax.lax.population_count(self.words).astype(jnp.int32)
         total = prefix_sum(population)
         self.before = total - population
@@ -137,14 +137,11 @@ def _neighbours(cells: jax.Array, occupied: _CellSet, max_cells: int) -> jax.Arr
     """(neighbours, C) int32: nodes of the occupied cells round each cell; the cell itself where none."""
     itself = jnp.arange(max_cells, dtype=jnp.int32)
     levels = (-1, 0, 1) if occupied.shape[2] > 1 else (0,)
-    rows = []
-    for offset in itertools.product((-1, 0, 1), (-1, 0, 1), levels):
-        if any(offset):
-            there = cells + jnp.array(offset)
-            inside = jnp.all((there >= 0) & (there < jnp.array(occupied.shape)), axis=1)
-            node = occupied.rank(jnp.where(inside[:, None], there, 0), inside)
-            rows.append(jnp.where(node < max_cells, node, itself))
-    return jnp.stack(rows)
+    offsets = [o for o in itertools.product((-1, 0, 1), (-1, 0, 1), levels) if any(o)]
+    there = cells + jnp.array(offsets)[:, None, :]
+    inside = jnp.all((there >= 0) & (there < jnp.array(occupied.shape)), axis=-1)
+    node = occupied.rank(jnp.where(inside[..., None], there, 0), inside)
+    return jnp.where(node < max_cells, node, itself)
 
 
 def _hook_and_jump(neighbours: jax.Array) -> jax.Array:
@@ -154,9 +151,7 @@ def _hook_and_jump(neighbours: jax.Array) -> jax.Array:
     def step(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         parent, _ = state
         grandparent = parent[parent]
-        lowest = grandparent
-        for row in neighbours:
-            lowest = jnp.minimum(lowest, grandparent[row])
+        lowest = jnp.minimum(grandparent, jnp.min(grandparent[neighbours], axis=0))
         hooked = parent.at[parent].min(lowest)
         new = jnp.minimum(hooked, lowest)
         return new, jnp.any(new != parent)

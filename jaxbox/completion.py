@@ -39,7 +39,8 @@ def _extend(low: jax.Array, high: jax.Array, size: jax.Array) -> tuple[jax.Array
     """Centres (..., 3) and size of an interval grown to `size`: from the near end, the far end, both."""
     grown = jnp.maximum(size, high - low)
     from_low, from_high, middle = low + grown / 2, high - grown / 2, (low + high) / 2
-    low_is_near = jnp.abs(low) < jnp.abs(high)
+    # The same as |low| < |high|, but right for a side without extent too: it grows away.
+    low_is_near = low + high > 0
     away = jnp.where(low_is_near, from_low, from_high)
     towards = jnp.where(low_is_near, from_high, from_low)
     return jnp.stack([away, towards, middle], axis=-1), grown

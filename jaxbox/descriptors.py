@@ -36,11 +36,14 @@ def shape_descriptors(
     """
     size = origin.shape[0]
     d = xy - origin[jnp.minimum(slot, size - 1)]
-    rows = jnp.stack([d[:, 0], d[:, 1], d[:, 0] ** 2, d[:, 1] ** 2, d[:, 0] * d[:, 1]], axis=1)
-    rows = jnp.concatenate([rows, jnp.ones_like(rows[:, :1])], axis=1)
-    sums = jnp.zeros((size, 6)).at[slot].add(rows, mode="drop")
-    count = sums[:, 5]
-    x, y, xx, yy, xy_ = (sums[:, :5] / jnp.maximum(count, 1)[:, None]).T
+    dx, dy = d[:, 0], d[:, 1]
+
+    def total(values: jax.Array) -> jax.Array:
+        # A scatter each: one of rows would first have to be built, which costs more (XLA, CPU).
+        return jnp.zeros(size).at[slot].add(values, mode="drop")
+
+    count = total(jnp.ones_like(dx))
+    x, y, xx, yy, xy_ = (total(v) / jnp.maximum(count, 1) for v in (dx, dy, dx * dx, dy * dy, dx * dy))
     major, minor = _eigenvalues(xx - x * x, yy - y * y, xy_ - x * y)
     present = count > 0
     ratio = jnp.maximum(major, MIN_VARIANCE) / jnp.maximum(minor, MIN_VARIANCE)

@@ -6,6 +6,8 @@ import math
 import jax
 import jax.numpy as jnp
 
+from jaxbox.masked import lookup, store
+
 SUPPORT_HALF_M = 100.0
 """The ground support grid covers |x|, |y| below this, in cells of 1 m."""
 
@@ -102,12 +104,14 @@ def build_evidence(
     rho = jnp.hypot(xyz[:, 0], xyz[:, 1])
     azimuth = azimuth_cell(jnp.arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths)
     seen = mask & (rho >= min_range_m)
-    shape = (num_ranges + 1, num_azimuths)
 
+    def scatter(range_cell: jax.Array, value: jax.Array, grid: jax.Array) -> jax.Array:
+        return grid.at[range_cell * num_azimuths + azimuth].add(value.astype(jnp.int32), mode="drop")
+
+    empty = jnp.zeros((num_ranges + 1) * num_azimuths, jnp.int32)
     is_hit = seen & (hit_min_height_m < height) & (height < hit_max_height_m)
-    hit_range = jnp.where(is_hit, (rho / range_cell_m).astype(jnp.int32), num_ranges)
-    hits = jnp.zeros(shape, jnp.int32).at[jnp.minimum(hit_range, num_ranges), azimuth].add(1)
-    hits = hits.at[num_ranges].set(0)
+    hit_range = (rho / range_cell_m).astype(jnp.int32)
+    hits = scatter(jnp.minimum(hit_range, num_ranges), is_hit & (hit_range < num_ranges), empty)
 
     drop = height - sensor_height_m
     downward = seen & (drop < -1e-3)
@@ -119,11 +123,11 @@ def build_evidence(
     first = jnp.minimum((first_m / range_cell_m).astype(jnp.int32) + 1, num_ranges)
     last = jnp.minimum((last_m / range_cell_m).astype(jnp.int32), num_ranges)
     is_free = downward & (last_m > first_m) & (last > first)
-    beams = jnp.zeros(shape, jnp.int32)
-    beams = beams.at[first, azimuth].add(is_free.astype(jnp.int32))
-    beams = beams.at[jnp.maximum(last, 0), azimuth].add(-is_free.astype(jnp.int32))
+    beams = scatter(first, is_free, empty)
+    beams = scatter(jnp.maximum(last, 0), -is_free.astype(jnp.int32), beams)
 
-    free, hit = _prefix_over_range(beams, hits)
+    shape = (num_ranges + 1, num_azimuths)
+    free, hit = _prefix_over_range(beams.reshape(shape), hits.reshape(shape))
     return Evidence(free, hit, _ground_support(xyz, height, mask, support_height_m))
 
 
@@ -159,9 +163,9 @@ def _ground_support(
     xyz: jax.Array, height: jax.Array, mask: jax.Array, support_height_m: jax.Array | float
 ) -> jax.Array:
     n = round(2 * SUPPORT_HALF_M)
-    index = jnp.clip(jnp.floor(xyz[:, :2] + SUPPORT_HALF_M).astype(jnp.int32), 0, n - 1)
+    i, j = (jnp.clip(jnp.floor(xyz[:, a] + SUPPORT_HALF_M).astype(jnp.int32), 0, n - 1) for a in (0, 1))
     on_ground = (mask & (jnp.abs(height) < support_height_m)).astype(jnp.float32)
-    count = jnp.zeros((n, n)).at[index[:, 0], index[:, 1]].add(on_ground)
+    count = jnp.zeros(n * n).at[i * n + j].add(on_ground).reshape(n, n)
     for axis in (0, 1):
         pad = [(SUPPORT_REACH, SUPPORT_REACH) if a == axis else (0, 0) for a in (0, 1)]
         padded = jnp.pad(count, pad)
@@ -182,7 +186,7 @@ def ground_support(evidence: Evidence, xy: jax.Array) -> jax.Array:
     """
     n = evidence.support.shape[0]
     index = jnp.clip(jnp.floor(xy + SUPPORT_HALF_M).astype(jnp.int32), 0, n - 1)
-    return evidence.support[index[..., 0], index[..., 1]]
+    return lookup(evidence.support, index[..., 0], index[..., 1])
 
 
 def cast_rays(
@@ -214,7 +218,25 @@ def cast_rays(
 
     Reference: oracle `jaxbox.reference.box_evidence`.
     """
-    azimuth, enter, leave = _ray_stretches(center, length, width, yaw, num_rays)
+    there = jnp.any(length >= 0)
+    stretches = store(_ray_stretches(center, length, width, yaw, num_rays), there)
+    crosses, met, free_cells, span = store(_sort_rays(evidence, *stretches, range_cell_m), there)
+    total = jnp.maximum(jnp.sum(crosses, axis=-1), 1)
+
+    def share(kind: int) -> jax.Array:
+        return jnp.sum(crosses & (met == kind), axis=-1) / total
+
+    free_length = jnp.sum(free_cells, axis=-1) / jnp.maximum(jnp.sum(span, axis=-1), 1)
+    return RayFractions(share(_HIT), share(_FREE), share(_DEEP), share(_OCCLUDED), free_length)
+
+
+_HIT, _FREE, _DEEP, _OCCLUDED = range(4)
+
+
+def _sort_rays(
+    evidence: Evidence, azimuth: jax.Array, enter: jax.Array, leave: jax.Array, range_cell_m: float
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """Whether each ray crosses its box, what it met there, its free cells inside, and all its cells there."""
     crosses = (leave > enter) & (enter >= MIN_ENTRY_M)
     num_ranges, num_azimuths = evidence.free.shape[0] - 1, evidence.free.shape[1]
     column = azimuth_cell(azimuth, num_azimuths)
@@ -223,7 +245,7 @@ def cast_rays(
         return jnp.clip(jnp.trunc(range_m / range_cell_m).astype(jnp.int32) + extra, 0, num_ranges)
 
     def between(prefix: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-        return (prefix[high, column] - prefix[low, column]).astype(jnp.int32)
+        return lookup(prefix, high, column) - lookup(prefix, low, column)
 
     near = cell(enter - HIT_BEFORE_M, 0)
     hit_end = cell(jnp.minimum(enter + HIT_AFTER_M, leave + HIT_BEYOND_M), 1)
@@ -232,21 +254,9 @@ def cast_rays(
     first, last = cell(enter + FREE_AFTER_M, 1), cell(leave - FREE_BEFORE_M, 0)
     span = jnp.where(crosses, jnp.maximum(last - first, 0), 0)
     free_cells = jnp.where(span > 0, between(evidence.free, first, last), 0)
-    is_free = free_cells > 0
-
-    total = jnp.maximum(jnp.sum(crosses, axis=-1), 1)
-
-    def share(kind: jax.Array) -> jax.Array:
-        return jnp.sum(crosses & kind, axis=-1) / total
-
-    free_length = jnp.sum(free_cells, axis=-1) / jnp.maximum(jnp.sum(span, axis=-1), 1)
-    return RayFractions(
-        hit=share(is_hit),
-        free=share(~is_hit & is_free),
-        deep=share(~is_hit & ~is_free & is_inside),
-        occluded=share(~is_hit & ~is_free & ~is_inside),
-        free_length=free_length,
-    )
+    blocked = jnp.where(is_inside, _DEEP, _OCCLUDED)
+    met = jnp.where(is_hit, _HIT, jnp.where(free_cells > 0, _FREE, blocked))
+    return crosses, met, free_cells.astype(jnp.int32), span
 
 
 def _ray_stretches(

@@ -1,9 +1,14 @@
 """Statistical filtering by mean shift and standard deviation (paper, section 3.1)."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 
 from jaxbox.masked import masked_mean, masked_std
+
+MIN_DENSITY = 1e-6
+"""Windows with less weight are empty; the smallest of one point in a corner is exp(-1.5) or so."""
 
 
 def filter_outliers(
@@ -43,42 +48,45 @@ def filter_outliers(
 
     Reference: paper, section 3.1 and figure 2; oracle `jaxbox.reference.filter_outliers`.
     """
-    shape = (round(2 * half_x_m / cell_m), round(2 * half_y_m / cell_m), num_levels)
-    origin = jnp.array([half_x_m, half_y_m, num_levels * cell_m / 2])
+    shape = (num_levels, round(2 * half_x_m / cell_m), round(2 * half_y_m / cell_m))
+    origin = jnp.array([num_levels * cell_m / 2, half_x_m, half_y_m])
 
     def cell_of(points: jax.Array) -> jax.Array:
-        index = jnp.floor((points + origin) / cell_m).astype(jnp.int32)
-        index = jnp.clip(index, 0, jnp.array(shape) - 1)
-        return (index[:, 0] * shape[1] + index[:, 1]) * shape[2] + index[:, 2]
+        z_x_y = (points[:, axis] for axis in (2, 0, 1))
+        cell = jnp.zeros(points.shape[0], jnp.int32)
+        for value, start, size in zip(z_x_y, origin, shape, strict=True):
+            index = jnp.floor((value + start) / cell_m).astype(jnp.int32)
+            cell = cell * size + jnp.clip(index, 0, size - 1)
+        return cell
 
     neighbour_weight = jnp.exp(-0.5 * (cell_m / jnp.asarray(bandwidth_m)) ** 2)
     cells = cell_of(xyz)
-    mean, density = _window_means(xyz, valid, cells, shape, neighbour_weight)
+    window = _window_means(xyz, valid, cells, shape, neighbour_weight)
 
-    mode = mean
+    mode = window
     for _ in range(num_iterations - 1):
-        there = cell_of(mode)
-        mode = jnp.where(density[there][:, None] > 0, mean[there], mode)
+        there = window[cell_of(mode)]
+        mode = jnp.where(there[:, 3:] > 0, there, mode)
 
-    distance = jnp.linalg.norm(xyz - mode[cells], axis=1)
+    end = mode[cells]
+    distance = jnp.sqrt(sum((xyz[:, axis] - end[:, axis]) ** 2 for axis in range(3)))
     threshold = masked_mean(distance, valid) + num_std * masked_std(distance, valid)
-    return valid & (distance <= threshold) & (density[cells] >= min_density)
+    return valid & (distance <= threshold) & (window[cells, 3] >= min_density)
 
 
 def _window_means(
     xyz: jax.Array, valid: jax.Array, cells: jax.Array, shape: tuple[int, int, int], weight: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Mean and weight of the 3 x 3 x 3 window of every cell: (cells, 3) m and (cells,)."""
+) -> jax.Array:
+    """(cells, 4): mean position (m) of the 3 x 3 x 3 window of every cell, and its weight."""
     rows = jnp.concatenate([xyz, jnp.ones_like(xyz[:, :1])], axis=1) * valid[:, None]
-    sums = jnp.zeros((shape[0] * shape[1] * shape[2], 4)).at[cells].add(rows).reshape(*shape, 4)
+    sums = jnp.zeros((math.prod(shape), 4)).at[cells].add(rows).reshape(*shape, 4)
     for axis in range(3):
         # The window is a product over the axes: three passes of three taps give all 27.
-        pad = [(1, 1) if a == axis else (0, 0) for a in range(4)]
-        padded = jnp.pad(sums, pad)
+        padded = jnp.pad(sums, [(1, 1) if a == axis else (0, 0) for a in range(4)])
         size = sums.shape[axis]
         before = jax.lax.slice_in_dim(padded, 0, size, axis=axis)
         after = jax.lax.slice_in_dim(padded, 2, size + 2, axis=axis)
         sums = sums + weight * (before + after)
     sums = sums.reshape(-1, 4)
-    density = sums[:, 3]
-    return sums[:, :3] / jnp.maximum(density, jnp.finfo(jnp.float32).tiny)[:, None], density
+    density = sums[:, 3:]
+    return jnp.concatenate([sums[:, :3] / jnp.maximum(density, MIN_DENSITY), density], axis=1)

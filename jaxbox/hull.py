@@ -5,6 +5,9 @@ import jax.numpy as jnp
 
 from jaxbox.masked import take
 
+MIN_EXTENT_M = 1e-6
+"""Clusters narrower than this are cut as if they were so wide: all their points are in one slice."""
+
 
 def extreme_points(slot: jax.Array, xy: jax.Array, *, num_clusters: int, num_slices: int) -> jax.Array:
     """The points of each cluster that can reach its hull: the extremes of thin slices.
@@ -26,40 +29,37 @@ def extreme_points(slot: jax.Array, xy: jax.Array, *, num_clusters: int, num_sli
     Reference: tested against cv2.convexHull of all points.
     """
     size = xy.shape[0]
-    low, extent = _bounds(slot, xy, num_clusters)
-    place = (xy - take(low, slot)) / jnp.maximum(take(extent, slot), 1e-6)
-    keys = []
-    for axis in (0, 1):
-        piece = jnp.clip((place[:, axis] * num_slices).astype(jnp.int32), 0, num_slices - 1)
-        across = place[:, 1 - axis]
+    place = [_place_in_bounds(slot, xy[:, axis], num_clusters) for axis in (0, 1)]
+    best = []
+    for along, across in (place, place[::-1]):
+        piece = jnp.clip((along * num_slices).astype(jnp.int32), 0, num_slices - 1)
+        cell = slot * num_slices + piece
         for value in (across, 1 - across):
-            keys.append(_argmax_per_slice(slot, piece, value, num_clusters, num_slices))
-    index = jnp.concatenate(keys, axis=1)
+            best.append(_argmax_per_cell(cell, value, num_clusters * num_slices))
+    index = jnp.concatenate([b.reshape(num_clusters, num_slices) for b in best], axis=1)
     return jnp.where(index < 0, size, index)
 
 
-def _bounds(slot: jax.Array, xy: jax.Array, num_clusters: int) -> tuple[jax.Array, jax.Array]:
-    """Lower corner and extent of each cluster, (K, 2) m each; 0 for an empty one."""
-    rows = jnp.concatenate([xy, -xy], axis=1)
-    upper = jnp.full((num_clusters, 4), -jnp.inf).at[slot].max(rows, mode="drop")
-    upper = jnp.where(jnp.isfinite(upper), upper, 0)
-    return -upper[:, 2:], upper[:, :2] + upper[:, 2:]
+def _place_in_bounds(slot: jax.Array, values: jax.Array, num_clusters: int) -> jax.Array:
+    """(N,) in [0, 1]: where each value lies between the least and the greatest of its cluster."""
+    low = jnp.full(num_clusters, jnp.inf).at[slot].min(values, mode="drop")
+    high = jnp.full(num_clusters, -jnp.inf).at[slot].max(values, mode="drop")
+    scale = 1 / jnp.maximum(high - low, MIN_EXTENT_M)
+    return jnp.clip((values - take(low, slot)) * take(scale, slot), 0, 1)
 
 
-def _argmax_per_slice(
-    slot: jax.Array, piece: jax.Array, value: jax.Array, num_clusters: int, num_slices: int
-) -> jax.Array:
-    """(K, S) int32: the point with the largest value, in [0, 1], of each slice; -1 where it is empty.
+def _argmax_per_cell(cell: jax.Array, value: jax.Array, num_cells: int) -> jax.Array:
+    """(cells,) int32: the point with the largest value, in [0, 1], of each cell; -1 where it is empty.
 
     One scatter finds the largest value and where it is: the value's leading bits stand above the
     point's index in one word.
     """
-    size = slot.shape[0]
+    size = cell.shape[0]
     index_bits = size.bit_length()
     value_bits = 32 - index_bits
-    quantised = (jnp.clip(value, 0, 1) * (2**value_bits - 1)).astype(jnp.uint32)
+    quantised = (value * (2**value_bits - 1)).astype(jnp.uint32)
     key = (quantised << index_bits) | (jnp.arange(size, dtype=jnp.uint32) + 1)
-    best = jnp.zeros((num_clusters, num_slices), jnp.uint32).at[slot, piece].max(key, mode="drop")
+    best = jnp.zeros(num_cells, jnp.uint32).at[cell].max(key, mode="drop")
     return (best & (2**index_bits - 1)).astype(jnp.int32) - 1
 
 
@@ -82,40 +82,40 @@ def convex_hull(xy: jax.Array, valid: jax.Array, *, max_vertices: int) -> tuple[
     Reference: paper, section 3.3 and equation 6; oracle cv2.convexHull.
     """
     lower, upper = _on_hull(xy, valid)
-    x = xy[:, 0]
-    num_lower = jnp.sum(lower)
-    upper = upper & ~lower
-    # Along the lower hull x rises, along the upper one it falls; no two vertices of one share x.
-    rank_lower = jnp.sum(lower[:, None] & (x[:, None] < x[None, :]), axis=0)
-    rank_upper = num_lower + jnp.sum(upper[:, None] & (x[:, None] > x[None, :]), axis=0)
-    count = num_lower + jnp.sum(upper)
-    size = xy.shape[0]
-    rank = jnp.where(lower, rank_lower, jnp.where(upper, rank_upper, size))
-    ordered = jnp.zeros_like(xy).at[rank].set(xy, mode="drop")
+    x, y = xy[:, 0], xy[:, 1]
+    # Along the lower hull x rises, along the upper one it falls.
+    part = jnp.where(lower, 0, jnp.where(upper, 1, 2))
+    _, _, x, y = jax.lax.sort((part, jnp.where(lower, x, -x), x, y), num_keys=2, is_stable=False)
+    count = jnp.sum(lower | upper)
     j = jnp.arange(max_vertices)
     pick = jnp.where(count > max_vertices, j * count // max_vertices, jnp.minimum(j, count - 1))
-    return ordered[jnp.clip(pick, 0, size - 1)], count
+    pick = jnp.clip(pick, 0, xy.shape[0] - 1)
+    return jnp.where(count > 0, jnp.stack([x[pick], y[pick]], axis=1), 0), count
 
 
 def _on_hull(xy: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Which points are vertices of the lower and of the upper hull, (M,) bool each."""
+    """Which points are vertices of the lower hull and which, beside those, of the upper, (M,) bool each."""
     x, y = xy[:, 0], xy[:, 1]
     index = jnp.arange(xy.shape[0])
-    dx = x[None, :] - x[:, None]
-    slope = (y[None, :] - y[:, None]) / jnp.where(dx == 0, 1, dx)
-    left, right = valid[:, None] & (dx > 0), valid[:, None] & (dx < 0)
+    # Entry [i, j] is about the point i as seen from j.
+    dx, dy = x[:, None] - x, y[:, None] - y
+    slope = dy / jnp.where(dx == 0, 1, dx)
+    there = valid[:, None]
+    left, right, same = there & (dx < 0), there & (dx > 0), there & (dx == 0)
+    # Of points above one another only the lowest and the highest count, and of equal ones the first.
+    twin = (dy == 0) & (index[:, None] < index)
+    lowest_right = _least(right, slope, same & ((dy < 0) | twin))
+    lowest_left = _least(left, slope, same & ((dy > 0) | twin))
+    highest_left = jnp.max(jnp.where(left, slope, -jnp.inf), axis=0)
+    highest_right = jnp.max(jnp.where(right, slope, -jnp.inf), axis=0)
+    lower = valid & (highest_left < lowest_right)
+    upper = valid & (highest_right < lowest_left)
+    return lower, upper & ~lower
 
-    def largest(side: jax.Array, sign: int) -> jax.Array:
-        return jnp.max(jnp.where(side, sign * slope, -jnp.inf), axis=0)
 
-    # Points above one another: only the lowest and the highest count, and of equal ones the first.
-    same = valid[:, None] & (dx == 0)
-    first = (y[:, None] == y[None, :]) & (index[:, None] < index[None, :])
-    is_lowest = ~jnp.any(same & ((y[:, None] < y[None, :]) | first), axis=0)
-    is_highest = ~jnp.any(same & ((y[:, None] > y[None, :]) | first), axis=0)
-    lower = valid & is_lowest & (largest(left, 1) < -largest(right, -1))
-    upper = valid & is_highest & (-largest(left, -1) > largest(right, 1))
-    return lower, upper
+def _least(side: jax.Array, slope: jax.Array, barred: jax.Array) -> jax.Array:
+    """(M,) least slope to the points of a side; minus infinity for a point that another one bars."""
+    return jnp.min(jnp.where(barred, -jnp.inf, jnp.where(side, slope, jnp.inf)), axis=0)
 
 
 def polygon_area(vertices: jax.Array) -> jax.Array:

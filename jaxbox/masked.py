@@ -72,6 +72,39 @@ def take(rows: jax.Array, index: jax.Array, fill: Any = 0) -> jax.Array:
     return rows.at[index].get(mode="fill", fill_value=fill)
 
 
+def lookup(table: jax.Array, *index: jax.Array) -> jax.Array:
+    """Entries of a table at indices that are known to lie inside.
+
+    One flat index: several would first be joined to rows, which costs more than the look-up (XLA, CPU).
+
+    Args:
+      table: (A, B, ...), as many axes as there are indices.
+      *index: int32 arrays of one shape, each within its axis.
+
+    Returns:
+      The shape of the indices.
+    """
+    flat = index[0]
+    for size, along in zip(table.shape[1:], index[1:], strict=True):
+        flat = flat * size + along
+    return jnp.take(table.reshape(-1), flat, mode="clip")
+
+
+def store(values: Any, proof: jax.Array) -> Any:
+    """Has values computed once and stored, where the compiler would compute them in every reader.
+
+    XLA fuses a producer into each of its consumers; a conditional is a wall that fusion does not cross.
+
+    Args:
+      values: pytree of arrays.
+      proof: () bool, True whenever the values are wanted; the compiler must not know that it is.
+
+    Returns:
+      The values, or zeros where `proof` is False.
+    """
+    return jax.lax.cond(proof, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
+
+
 def masked_mean(values: jax.Array, mask: jax.Array) -> jax.Array:
     """Mean of the masked values along the last axis; 0 where there are none.
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxbox import box, clustering, completion, descriptors, evidence, filtering, ground, hull, vehicles
 from jaxbox.config import DetectorConfig
 from jaxbox.geometry import wrap_yaw
-from jaxbox.masked import compact, map_rows, take
+from jaxbox.masked import compact, map_rows, store, take
 from jaxbox.types import (
     NOT_A_BOX,
     Boxes,
@@ -25,8 +25,11 @@ from jaxbox.types import (
     Status,
 )
 
-PROPOSAL_CHUNK = 64
-"""Proposals held against the evidence at a time."""
+PROPOSAL_CHUNK = 256
+"""Proposals held against the evidence at a time: a loop over their points has few, wide steps."""
+
+HULL_CHUNK = 16
+"""Clusters whose hulls are traced at a time: each compares all pairs of its points."""
 
 INSIDE_TOLERANCE_M = 1e-3
 """A point on the face of its box is inside."""
@@ -253,7 +256,7 @@ def _hull_points(
     )  # fmt: skip
     index = jnp.where(index < proposals.cluster.size, index % num_obstacles, num_obstacles)
     trace = functools.partial(_hulls, obstacles.xy, config.hull.max_vertices)
-    vertices, count = map_rows(trace, index, num_rows=proposals.num_clusters, chunk=PROPOSAL_CHUNK)
+    vertices, count = map_rows(trace, index, num_rows=proposals.num_clusters, chunk=HULL_CHUNK)
     return vertices, jnp.minimum(count, config.hull.max_vertices)
 
 
@@ -526,11 +529,12 @@ def conclude(
     row, num = compact(keep, settings.max_detections)
     kept = jax.tree.map(lambda a: take(a, row), dataclasses.replace(candidates, num=keep))
     valid = row < keep.shape[0]
-    owner = _owners(kept, valid, obstacles, proposals)
+    owner = store(_owners(kept, valid, obstacles, proposals), ~jnp.all(cloud.num_points < 0))
     outline = hull.extreme_points(
         owner, obstacles.xy, num_clusters=settings.max_detections, num_slices=config.hull.num_slices
     )
-    vertices, num_vertices = _hulls(obstacles.xy, config.hull.max_vertices, outline)
+    trace = functools.partial(_hulls, obstacles.xy, config.hull.max_vertices)
+    vertices, num_vertices = map_rows(trace, outline, num_rows=num, chunk=HULL_CHUNK)
     num_points = jnp.zeros(settings.max_detections, jnp.int32).at[owner].add(1, mode="drop")
     shapes = descriptors.shape_descriptors(
         owner, obstacles.xy, kept.rectangle[:, :2], hull.polygon_area(vertices), num_vertices
@@ -569,14 +573,15 @@ def _owners(
     num_detections, num_clusters = valid.shape[0], proposals.num_points.shape[0]
     rank = jnp.where(valid, jnp.arange(num_detections), num_detections)
     of_cluster = jnp.full(num_clusters, num_detections).at[kept.cluster].min(rank, mode="drop")
+    x, y, length, width, yaw = kept.rectangle.T
+    frame = jnp.stack([x, y, jnp.cos(yaw), jnp.sin(yaw), length / 2, width / 2], axis=1)
     owner = jnp.full(obstacles.row.shape, num_detections)
     for cluster in proposals.cluster:
         detection = take(of_cluster, cluster, num_detections)
-        r = take(kept.rectangle, detection)
-        dx, dy = obstacles.xy[:, 0] - r[:, 0], obstacles.xy[:, 1] - r[:, 1]
-        cos, sin = jnp.cos(r[:, 4]), jnp.sin(r[:, 4])
-        inside = jnp.abs(dx * cos + dy * sin) <= r[:, 2] / 2 + INSIDE_TOLERANCE_M
-        inside = inside & (jnp.abs(dy * cos - dx * sin) <= r[:, 3] / 2 + INSIDE_TOLERANCE_M)
+        x, y, cos, sin, half_length, half_width = take(frame, detection).T
+        dx, dy = obstacles.xy[:, 0] - x, obstacles.xy[:, 1] - y
+        inside = jnp.abs(dx * cos + dy * sin) <= half_length + INSIDE_TOLERANCE_M
+        inside = inside & (jnp.abs(dy * cos - dx * sin) <= half_width + INSIDE_TOLERANCE_M)
         owner = jnp.minimum(owner, jnp.where(inside, detection, num_detections))
     return owner
 
