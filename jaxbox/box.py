@@ -18,6 +18,9 @@ VOTE_POINTS, VOTE_EXTENT_M = 150.0, 6.0
 Extents = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 """Lower and upper bounds of u, then of v, each (C, A)."""
 
+Clusters = tuple[jax.Array, jax.Array]
+"""Points (C, M, 2) m and how many of them count (C,)."""
+
 
 def sample_points(cluster: jax.Array, *, num_clusters: int, max_points: int) -> tuple[jax.Array, jax.Array]:
     """Gathers the points of each cluster in a table, spread evenly over it where there are too many.
@@ -74,9 +77,9 @@ def try_rotations(
     angle = jnp.arange(num_angles) * (math.pi / 2 / num_angles)
     cos, sin = jnp.cos(angle), jnp.sin(angle)
 
-    def rate(rows: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, Extents]:
-        extents = _extents(*rows, cos, sin)
-        return _CRITERIA[criterion](*rows, cos, sin, extents, min_distance_m), extents
+    def rate(clusters: Clusters) -> tuple[jax.Array, Extents]:
+        extents = _extents(*clusters, cos, sin)
+        return _CRITERIA[criterion](clusters, cos, sin, extents, min_distance_m), extents
 
     return map_rows(rate, (points, count), num_rows=num_clusters, chunk=CHUNK)
 
@@ -93,26 +96,26 @@ def _extents(points: jax.Array, count: jax.Array, cos: jax.Array, sin: jax.Array
 
 
 def _area(
-    points: jax.Array, count: jax.Array, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
-) -> jax.Array:  # fmt: skip
+    clusters: Clusters, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
+) -> jax.Array:
     u0, u1, v0, v1 = extents
     return -(u1 - u0) * (v1 - v0)
 
 
 def _closeness(
-    points: jax.Array, count: jax.Array, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
-) -> jax.Array:  # fmt: skip
+    clusters: Clusters, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
+) -> jax.Array:
     u0, u1, v0, v1 = extents
 
     def distance(u: jax.Array, v: jax.Array) -> jax.Array:
         return jnp.minimum(jnp.minimum(u - u0, u1 - u), jnp.minimum(v - v0, v1 - v))
 
-    return _mean_closeness(points, count, cos, sin, distance, d0)
+    return _mean_closeness(clusters, cos, sin, distance, d0)
 
 
 def _visible_closeness(
-    points: jax.Array, count: jax.Array, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
-) -> jax.Array:  # fmt: skip
+    clusters: Clusters, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
+) -> jax.Array:
     u0, u1, v0, v1 = extents
     # The sensor is the origin: of two opposite edges it sees the one nearer to 0.
     u_near = jnp.where(jnp.abs(u0) < jnp.abs(u1), u0, u1)
@@ -121,12 +124,11 @@ def _visible_closeness(
     def distance(u: jax.Array, v: jax.Array) -> jax.Array:
         return jnp.minimum(jnp.abs(u - u_near), jnp.abs(v - v_near))
 
-    return _mean_closeness(points, count, cos, sin, distance, d0)
+    return _mean_closeness(clusters, cos, sin, distance, d0)
 
 
 def _mean_closeness(
-    points: jax.Array,
-    count: jax.Array,
+    clusters: Clusters,
     cos: jax.Array,
     sin: jax.Array,
     distance: Callable[[jax.Array, jax.Array], jax.Array],
@@ -135,13 +137,14 @@ def _mean_closeness(
     def update(total: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
         return total + d0 / jnp.maximum(distance(x * cos + y * sin, y * cos - x * sin), d0)
 
+    points, count = clusters
     zero = jnp.zeros((points.shape[0], cos.shape[0]))
     return fold_points(points, count, zero, update) / jnp.maximum(count, 1)[:, None]
 
 
 def _variance(
-    points: jax.Array, count: jax.Array, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
-) -> jax.Array:  # fmt: skip
+    clusters: Clusters, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
+) -> jax.Array:
     u0, u1, v0, v1 = extents
 
     def update(state: tuple[jax.Array, ...], x: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
@@ -152,6 +155,7 @@ def _variance(
         du, dv = jnp.where(along_u, du, 0), jnp.where(along_u, 0, dv)
         return nu + along_u, su + du, ssu + du**2, nv + ~along_u, sv + dv, ssv + dv**2
 
+    points, count = clusters
     zero = jnp.zeros((points.shape[0], cos.shape[0]))
     nu, su, ssu, nv, sv, ssv = fold_points(points, count, (zero,) * 6, update)
 

@@ -113,7 +113,9 @@ class _CellSet:
         flat = jnp.where(member, self._flat(index), slots)
         flags = jnp.zeros(slots, jnp.uint8).at[flat].set(1, mode="drop")
         rows = flags.reshape(WORD_BITS, self.num_words).astype(jnp.uint32)
-        self.words = jnp.sum(rows << jnp.arange(WORD_BITS, dtype=jnp.uint32)[:, None], axis=0, dtype=jnp.uint32)
+        self.words = jnp.sum(
+            rows << jnp.arange(WORD_BITS, dtype=jnp.uint32)[:, None], axis=0, dtype=jnp.uint32
+        )
         population = jax.lax.population_count(self.words).astype(jnp.int32)
         total = prefix_sum(population)
         self.before = total - population

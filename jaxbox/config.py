@@ -6,6 +6,7 @@ Lengths are metres, angles degrees (``_deg``), everything else unitless unless s
 """
 
 import dataclasses
+import math
 from collections.abc import Iterable
 from typing import Any, Literal, TypeVar, dataclass_transform
 
@@ -31,9 +32,9 @@ def _config(cls: type[_T]) -> type[_T]:
 class RegionConfig:
     """The part of the world that is looked at; points outside are counted and left out."""
 
-    half_x_m: float = _static(80.0)
+    half_x_m: float = _static(default=80.0)
     """static: |x| below this."""
-    half_y_m: float = _static(60.0)
+    half_y_m: float = _static(default=60.0)
     """static: |y| below this."""
 
 
@@ -41,13 +42,13 @@ class RegionConfig:
 class FilterConfig:
     """Statistical filtering by mean shift and standard deviation (paper, 3.1)."""
 
-    enabled: bool = _static(True)
+    enabled: bool = _static(default=True)
     """static: whether the stage runs."""
-    cell_m: float = _static(1.0)
+    cell_m: float = _static(default=1.0)
     """static: edge of the grid's cells, over the region."""
-    num_levels: int = _static(8)
+    num_levels: int = _static(default=8)
     """static: cells of the grid in height, centred on the sensor; points beyond join the end levels."""
-    num_iterations: int = _static(3)
+    num_iterations: int = _static(default=3)
     """static: mean shift iterations."""
     bandwidth_m: Scalar = 1.0
     """Standard deviation of the Gaussian window that weighs the neighbouring cells."""
@@ -61,20 +62,20 @@ class FilterConfig:
 class GroundConfig:
     """RANSAC ground removal (Algorithm I), and the ground grid that follows uneven roads."""
 
-    candidates: Literal["cell_minima", "points"] = _static("cell_minima")
+    candidates: Literal["cell_minima", "points"] = _static(default="cell_minima")
     """static: what planes are fitted to: the lowest point of each 1 m cell, or points spread evenly
     over the sweep (the paper)."""
-    num_candidates: int = _static(4096)
+    num_candidates: int = _static(default=4096)
     """static: how many points for ``candidates="points"``."""
-    candidate_half_x_m: float = _static(40.0)
+    candidate_half_x_m: float = _static(default=40.0)
     """static: cell minima are taken where |x| is below this."""
-    candidate_half_y_m: float = _static(20.0)
+    candidate_half_y_m: float = _static(default=20.0)
     """static: cell minima are taken where |y| is below this."""
-    num_hypotheses: int = _static(128)
+    num_hypotheses: int = _static(default=128)
     """static: R, planes sampled in a round."""
-    max_planes: int = _static(1)
+    max_planes: int = _static(default=1)
     """static: rounds; each removes the inliers of its plane (Algorithm I, "repeat")."""
-    num_refits: int = _static(3)
+    num_refits: int = _static(default=3)
     """static: refits of the best plane on all its inliers."""
     tolerance_m: Scalar = 0.2
     """A candidate within this of a plane is an inlier."""
@@ -82,13 +83,13 @@ class GroundConfig:
     """Steeper planes are no ground."""
     min_inlier_fraction: Scalar = 0.1
     """A plane with a smaller share of the candidates is no ground."""
-    surface: bool = _static(True)
+    surface: bool = _static(default=True)
     """static: refine the plane by the ground grid; False stops at the planes (the paper)."""
-    surface_cell_m: float = _static(0.5)
+    surface_cell_m: float = _static(default=0.5)
     """static: edge of the ground grid's cells."""
-    surface_half_m: float = _static(80.0)
+    surface_half_m: float = _static(default=80.0)
     """static: the ground grid covers |x|, |y| below this; beyond it its border value holds."""
-    num_envelope_rounds: int = _static(10)
+    num_envelope_rounds: int = _static(default=10)
     """static: cells over which the slope limit spreads."""
     max_grade: Scalar = 0.2
     """Steepest rise of the ground relative to the plane, m/m."""
@@ -116,13 +117,13 @@ class GroundConfig:
 class ComponentMap:
     """One occupancy grid whose connected components propose clusters."""
 
-    cell_m: float = _static(0.2)
+    cell_m: float = _static(default=0.2)
     """static: edge of the cells; neighbours (also diagonal ones) are linked."""
-    num_levels: int = _static(1)
+    num_levels: int = _static(default=1)
     """static: cells in height; 1 is a bird's-eye view map, more is a 3D grid."""
-    max_cells: int = _static(16384)
+    max_cells: int = _static(default=16384)
     """static: capacity for occupied cells."""
-    max_clusters: int = _static(512)
+    max_clusters: int = _static(default=512)
     """static: capacity for clusters that pass the gates."""
     min_height_m: Scalar = 0.2
     """Only points higher above the ground than this."""
@@ -145,7 +146,7 @@ class ClusteringConfig:
         ComponentMap(cell_m=0.5, max_cells=8192),
     )
     """The component maps; the first also gives the scene direction and the components for display."""
-    max_obstacles: int | None = _static(None)
+    max_obstacles: int | None = _static(default=None)
     """static: capacity for points above the ground; None is 3/4 of the cloud's capacity."""
     adaptive_start_m: Scalar = 20.0
     """Range from which the linking distance grows."""
@@ -161,13 +162,13 @@ class ClusteringConfig:
 class EvidenceConfig:
     """What each beam says about a box: hit, seen through (free) or hidden, on a polar grid."""
 
-    enabled: bool = _static(True)
+    enabled: bool = _static(default=True)
     """static: whether the evidence is built; without it every box counts as hit."""
-    num_azimuths: int = _static(1440)
+    num_azimuths: int = _static(default=1440)
     """static: azimuth cells of the polar grid, all round."""
-    num_ranges: int = _static(320)
+    num_ranges: int = _static(default=320)
     """static: range cells of the polar grid."""
-    range_cell_m: float = _static(0.25)
+    range_cell_m: float = _static(default=0.25)
     """static: length of a range cell."""
     min_range_m: Scalar = 2.0
     """Nearer returns are the carrier vehicle."""
@@ -189,9 +190,9 @@ class EvidenceConfig:
 class HullConfig:
     """Convex hull (paper, 3.3)."""
 
-    max_vertices: int = _static(32)
+    max_vertices: int = _static(default=32)
     """static: H, capacity for hull vertices."""
-    num_slices: int = _static(32)
+    num_slices: int = _static(default=32)
     """static: slices along each axis whose extreme points reach the hull; the hull misses points by
     at most one slice (the cluster's extent over the number of slices)."""
 
@@ -200,16 +201,18 @@ class HullConfig:
 class BoxConfig:
     """Rectangle by trying all rotations (paper, 3.4, Algorithm III)."""
 
-    criterion: Literal["area", "variance", "closeness", "visible_closeness"] = _static("visible_closeness")
+    criterion: Literal["area", "variance", "closeness", "visible_closeness"] = _static(
+        default="visible_closeness"
+    )
     """static: what the best rotation has: the smallest area (the paper), the smallest variance of the
     distances to the edges, the points closest to the edges, or to the two edges facing the sensor."""
-    num_angles: int = _static(90)
+    num_angles: int = _static(default=90)
     """static: A, rotations tried over 90 degrees."""
-    fit_to: Literal["slab", "hull"] = _static("slab")
+    fit_to: Literal["slab", "hull"] = _static(default="slab")
     """static: fit to points of the cluster between two heights, or to its convex hull (the paper)."""
-    max_points: int = _static(128)
+    max_points: int = _static(default=128)
     """static: M, points of a cluster that the rectangle is fitted to, spread evenly over it."""
-    max_slab_points: int | None = _static(None)
+    max_slab_points: int | None = _static(default=None)
     """static: capacity for points between the slab's heights; None is 1/4 of the cloud's capacity."""
     slab_min_height_m: Scalar = 0.2
     """Only points higher than this shape the rectangle: below are wheels and kerb."""
@@ -219,7 +222,7 @@ class BoxConfig:
     """Clusters with fewer points between those heights are fitted to all their points."""
     min_distance_m: Scalar = 0.05
     """Closeness: points nearer to an edge than this count as on it."""
-    scene_direction: bool = _static(True)
+    scene_direction: bool = _static(default=True)
     """static: prefer the direction that most boxes of the sweep share."""
     direction_weight: Scalar = 0.2
     """Height of that preference, in closeness."""
@@ -235,12 +238,12 @@ class BoxConfig:
 class CompletionConfig:
     """Correction for occluded vehicles: sides out of sight are completed by the class prior."""
 
-    mode: Literal["none", "away", "evidence"] = _static("evidence")
+    mode: Literal["none", "away", "evidence"] = _static(default="evidence")
     """static: keep the rectangle as measured (the paper); extend its hidden sides away from the
     sensor; or let the evidence choose among hypotheses."""
-    num_rays: int = _static(32)
+    num_rays: int = _static(default=32)
     """static: rays over the box when hypotheses are compared."""
-    num_final_rays: int = _static(48)
+    num_final_rays: int = _static(default=48)
     """static: rays over the box for its score."""
     free_weight: Scalar = 1.0
     """Cost of the fraction of rays that pass through."""
@@ -291,23 +294,50 @@ class ClassPrior:
 
 # Sizes are medians over the 7,481 KITTI object label files; gates and widths were chosen on KITTI.
 CAR = ClassPrior(
-    length_m=3.9, width_m=1.63, height_m=1.5,
-    length_below_m=0.8, length_above_m=2.0, width_tolerance_m=0.3, height_tolerance_m=0.3,
-    min_height_m=1.0, max_height_m=2.3, max_length_m=6.5, max_width_m=2.4, min_box_height_m=1.48,
+    length_m=3.9,
+    width_m=1.63,
+    height_m=1.5,
+    length_below_m=0.8,
+    length_above_m=2.0,
+    width_tolerance_m=0.3,
+    height_tolerance_m=0.3,
+    min_height_m=1.0,
+    max_height_m=2.3,
+    max_length_m=6.5,
+    max_width_m=2.4,
+    min_box_height_m=1.48,
     count_max_height_m=2.0,
-)  # fmt: skip
+)
 VAN = ClassPrior(
-    length_m=4.98, width_m=1.88, height_m=2.13,
-    length_below_m=0.8, length_above_m=1.5, width_tolerance_m=0.3, height_tolerance_m=0.35,
-    min_height_m=1.7, max_height_m=2.7, max_length_m=7.5, max_width_m=2.6, min_box_height_m=1.8,
+    length_m=4.98,
+    width_m=1.88,
+    height_m=2.13,
+    length_below_m=0.8,
+    length_above_m=1.5,
+    width_tolerance_m=0.3,
+    height_tolerance_m=0.35,
+    min_height_m=1.7,
+    max_height_m=2.7,
+    max_length_m=7.5,
+    max_width_m=2.6,
+    min_box_height_m=1.8,
     count_max_height_m=2.7,
-)  # fmt: skip
+)
 TRUCK = ClassPrior(
-    length_m=10.81, width_m=2.63, height_m=3.34,
-    length_below_m=5.0, length_above_m=4.0, width_tolerance_m=0.4, height_tolerance_m=0.8,
-    min_height_m=2.4, max_height_m=4.0, max_length_m=18.0, max_width_m=3.2, min_box_height_m=2.6,
+    length_m=10.81,
+    width_m=2.63,
+    height_m=3.34,
+    length_below_m=5.0,
+    length_above_m=4.0,
+    width_tolerance_m=0.4,
+    height_tolerance_m=0.8,
+    min_height_m=2.4,
+    max_height_m=4.0,
+    max_length_m=18.0,
+    max_width_m=3.2,
+    min_box_height_m=2.6,
     count_max_height_m=4.0,
-)  # fmt: skip
+)
 
 
 @_config
@@ -318,13 +348,13 @@ class VehicleConfig:
     """Priors of car, van and truck."""
     large_height_m: Scalar = 1.7
     """Clusters higher than this are also tried as a van or a truck."""
-    max_large: int = _static(512)
+    max_large: int = _static(default=512)
     """static: capacity for clusters also tried as a van or a truck."""
-    max_candidates: int = _static(512)
+    max_candidates: int = _static(default=512)
     """static: capacity for boxes that pass the gates, before suppression."""
-    max_detections: int = _static(128)
+    max_detections: int = _static(default=128)
     """static: K, capacity for boxes in the answer."""
-    max_nearby: int = _static(2048)
+    max_nearby: int = _static(default=2048)
     """static: points looked at round a box; where there are more, every so many are and count so
     many times."""
     margin_m: Scalar = 0.1
@@ -394,3 +424,93 @@ class DetectorConfig:
     def presets(cls) -> dict[str, "DetectorConfig"]:
         """The named presets that the command line offers."""
         return {"default": cls(), "paper": cls.paper()}
+
+    @classmethod
+    def for_sweeps(
+        cls, sweeps: Iterable[np.ndarray], *, base: "DetectorConfig | None" = None, margin: float = 1.25
+    ) -> "DetectorConfig":
+        """Proposes capacities for sweeps like these, from a rough look at each.
+
+        The ground is taken to be the lowest point within a metre or two; the points above it, those that
+        boxes are fitted to and the occupied cells of each map are counted. It is a proposal, not a bound:
+        `Detections.raise_if_failed` checks each sweep's answer, and names the size that was missing.
+
+        Args:
+          sweeps: at least one (n, 3) array, m, sensor frame; NaN and infinity are ignored.
+          base: where all else comes from; None for the default preset.
+          margin: the largest count of any sweep times this is proposed, at least 1.
+
+        Returns:
+          `base` with other clustering.max_obstacles, box.max_slab_points and max_cells of each map:
+          multiples of 1024, so that proposals from similar sweeps share one compile.
+
+        Raises:
+          ValueError: for no sweeps, an array of another shape, or a margin below 1.
+
+        >>> DetectorConfig.for_sweeps([np.zeros((100, 3))]).box.max_slab_points
+        1024
+        """
+        base = cls() if base is None else base
+        if not margin >= 1:
+            raise ValueError(f"margin is {margin}; it must be at least 1.")
+        counts = [_rough_counts(base, index, xyz) for index, xyz in enumerate(sweeps)]
+        if not counts:
+            raise ValueError("there are no sweeps; pass at least one (n, 3) array.")
+        largest = np.maximum(margin * np.max(counts, axis=0), 1)
+        obstacles, slab, *cells = (CAPACITY_STEP * math.ceil(size / CAPACITY_STEP) for size in largest)
+        maps = zip(base.clustering.maps, cells, strict=True)
+        maps = tuple(dataclasses.replace(m, max_cells=size) for m, size in maps)
+        return dataclasses.replace(
+            base,
+            clustering=dataclasses.replace(base.clustering, maps=maps, max_obstacles=obstacles),
+            box=dataclasses.replace(base.box, max_slab_points=slab),
+        )
+
+
+CAPACITY_STEP = 1024
+"""Proposed capacities are multiples of this."""
+
+
+def _rough_counts(config: DetectorConfig, index: int, xyz: np.ndarray) -> list[int]:
+    """Points above the ground, points that boxes are fitted to, and occupied cells of each map."""
+    xyz = np.asarray(xyz)
+    if xyz.ndim != 2 or xyz.shape[1] != 3:
+        raise ValueError(f"sweep {index} has shape {xyz.shape}; it must be (n, 3). Pass points[:, :3].")
+    region = np.array([config.region.half_x_m, config.region.half_y_m])
+    within = np.isfinite(xyz).all(axis=1) & (np.abs(xyz[:, :2]) < region).all(axis=1)
+    xyz = xyz[within].astype(np.float64)
+    xy, height = xyz[:, :2], _rough_height(xyz)
+
+    def between(settings: GroundConfig | ComponentMap) -> np.ndarray:
+        return (height > settings.min_height_m) & (height < settings.max_height_m)
+
+    slab = (height > config.box.slab_min_height_m) & (height < config.box.slab_max_height_m)
+    drawn = _rough_warp(xy, config.clustering)
+    counts = [np.sum(between(config.ground)), np.sum(slab & between(config.ground))]
+    for m in config.clustering.maps:
+        level = np.minimum((height - m.min_height_m) // m.cell_m, m.num_levels - 1)
+        cells = np.column_stack([drawn // m.cell_m, level])[between(m)]
+        counts.append(len(np.unique(cells, axis=0)))
+    return [int(count) for count in counts]
+
+
+def _rough_height(xyz: np.ndarray) -> np.ndarray:
+    """(n,) m: height over the lowest point of the 1 m cell and the eight round it."""
+    if len(xyz) == 0:
+        return np.zeros(0)
+    cell = np.floor(xyz[:, :2]).astype(int)
+    cell -= cell.min(axis=0)
+    lowest = np.full(cell.max(axis=0) + 3, np.inf)
+    for i, j in np.ndindex(3, 3):
+        np.minimum.at(lowest, (cell[:, 0] + i, cell[:, 1] + j), xyz[:, 2])
+    return xyz[:, 2] - lowest[cell[:, 0] + 1, cell[:, 1] + 1]
+
+
+def _rough_warp(xy: np.ndarray, settings: ClusteringConfig) -> np.ndarray:
+    """Far points drawn together as the maps draw them, so that beyond the start cells hold more."""
+    rho = np.linalg.norm(xy, axis=1)
+    beyond, growth = (
+        np.maximum(rho - settings.adaptive_start_m, 0),
+        max(float(settings.adaptive_growth), 1e-9),
+    )
+    return xy * (1 + (np.log1p(growth * beyond) / growth - beyond) / np.maximum(rho, 1e-9))[:, None]

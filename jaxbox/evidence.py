@@ -170,7 +170,7 @@ def _ground_support(
         pad = [(SUPPORT_REACH, SUPPORT_REACH) if a == axis else (0, 0) for a in (0, 1)]
         padded = jnp.pad(count, pad)
         slices = [jax.lax.slice_in_dim(padded, k, k + n, axis=axis) for k in range(2 * SUPPORT_REACH + 1)]
-        count = sum(slices)
+        count = jnp.sum(jnp.stack(slices), axis=0)
     return count
 
 
@@ -219,15 +219,22 @@ def cast_rays(
     Reference: oracle `jaxbox.reference.box_evidence`.
     """
     there = jnp.any(length >= 0)
-    stretches = store(_ray_stretches(center, length, width, yaw, num_rays), there)
-    crosses, met, free_cells, span = store(_sort_rays(evidence, *stretches, range_cell_m), there)
+    azimuth, enter, leave = store(_ray_stretches(center, length, width, yaw, num_rays), there)
+    met_inside = _sort_rays(evidence, azimuth, enter, leave, range_cell_m)
+    crosses, met, free_cells, span = store(met_inside, there)
     total = jnp.maximum(jnp.sum(crosses, axis=-1), 1)
 
     def share(kind: int) -> jax.Array:
         return jnp.sum(crosses & (met == kind), axis=-1) / total
 
     free_length = jnp.sum(free_cells, axis=-1) / jnp.maximum(jnp.sum(span, axis=-1), 1)
-    return RayFractions(share(_HIT), share(_FREE), share(_DEEP), share(_OCCLUDED), free_length)
+    return RayFractions(
+        hit=share(_HIT),
+        free=share(_FREE),
+        deep=share(_DEEP),
+        occluded=share(_OCCLUDED),
+        free_length=free_length,
+    )
 
 
 _HIT, _FREE, _DEEP, _OCCLUDED = range(4)

@@ -1,6 +1,7 @@
 """Ground removal: RANSAC planes (paper, Algorithm I), and a ground grid for uneven roads."""
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -128,9 +129,14 @@ def fit_ground_plane(
 
 
 def fit_ground_planes(
-    candidates: jax.Array, mask: jax.Array, key: jax.Array, *, max_planes: int, tolerance_m: jax.Array | float,
-    **options: jax.Array | float,
-) -> tuple[GroundPlane, jax.Array]:  # fmt: skip
+    candidates: jax.Array,
+    mask: jax.Array,
+    key: jax.Array,
+    *,
+    max_planes: int,
+    tolerance_m: jax.Array | float,
+    **options: Any,
+) -> tuple[GroundPlane, jax.Array]:
     """Fits plane after plane, each to the candidates that the ones before leave over.
 
     Args:
@@ -145,15 +151,15 @@ def fit_ground_planes(
       first: the first plane, which carries the most support.
       planes: (max_planes, 3) float32: all of them; the first again where a round found none.
     """
-    first = None
+    fits: list[GroundPlane] = []
     planes = []
     for round_key in jax.random.split(key, max_planes):
-        plane = fit_ground_plane(candidates, mask, round_key, tolerance_m=tolerance_m, **options)  # pyright: ignore
-        first = plane if first is None else first
-        planes.append(jnp.where(plane.found, plane.coefficients, first.coefficients))
+        plane = fit_ground_plane(candidates, mask, round_key, tolerance_m=tolerance_m, **options)
+        fits.append(plane)
+        planes.append(jnp.where(plane.found, plane.coefficients, fits[0].coefficients))
         covered = jnp.abs(plane_residual(candidates, plane.coefficients)) < tolerance_m
         mask = mask & ~(covered & plane.found)
-    return first, jnp.stack(planes)
+    return fits[0], jnp.stack(planes)
 
 
 def plane_residual(xyz: jax.Array, plane: jax.Array) -> jax.Array:
@@ -263,7 +269,9 @@ def fit_ground_surface(
     )
     index = jnp.floor((xyz[:, :2] + half_m) / cell_m).astype(jnp.int32)
     inside = jnp.all((index >= 0) & (index < n), axis=1)
-    cell = jnp.where(mask & near_plane & inside & (rho > blind_radius_m), index[:, 0] * n + index[:, 1], n * n)
+    cell = jnp.where(
+        mask & near_plane & inside & (rho > blind_radius_m), index[:, 0] * n + index[:, 1], n * n
+    )
     lowest = jnp.full(n * n, jnp.inf).at[cell].min(residual, mode="drop").reshape(n, n)
     envelope = _lower_envelope(lowest, max_grade * cell_m, num_envelope_rounds)
     ground = jnp.isfinite(lowest) & (lowest < envelope + envelope_margin_m)
@@ -292,9 +300,7 @@ def _smooth(height: jax.Array, weight: jax.Array, sigma_cells: jax.Array | float
 
     def blur(kernel: jax.Array, grid: jax.Array) -> jax.Array:
         # The Gaussian is separable, and a product with a banded matrix is the fastest convolution here.
-        return jnp.matmul(
-            jnp.matmul(kernel, grid, precision="highest"), kernel.T, precision="highest"
-        )
+        return jnp.matmul(jnp.matmul(kernel, grid, precision="highest"), kernel.T, precision="highest")
 
     far = blur(wide, height) / (blur(wide, weight) + FAR_FILL_PRIOR)
     return (blur(narrow, height) + FAR_FILL_WEIGHT * far) / (blur(narrow, weight) + FAR_FILL_WEIGHT)

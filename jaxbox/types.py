@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-CAPACITY_BUCKETS = tuple(2**k for k in range(14, 21))
+CAPACITY_BUCKETS: tuple[int, ...] = tuple(2**k for k in range(14, 21))
 """Point capacities that `PointCloud.from_numpy` pads to: 16,384 to 1,048,576. One compile a bucket."""
 
 
@@ -116,7 +116,8 @@ class PointCloud:
         """
         xyz, intensity = _checked_points(xyz, intensity)
         if capacity is None:
-            capacity = next((b for b in CAPACITY_BUCKETS if b >= len(xyz)), CAPACITY_BUCKETS[-1])
+            buckets = [b for b in CAPACITY_BUCKETS if b >= len(xyz)]
+            capacity = buckets[0] if buckets else CAPACITY_BUCKETS[-1]
         if capacity < 1:
             raise ValueError(f"capacity is {capacity}; it must be at least 1.")
         num_points = len(xyz)

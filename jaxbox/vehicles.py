@@ -159,7 +159,9 @@ def _count_runs(
     return jax.lax.fori_loop(0, steps, step, Surroundings(zero, zero, zero, zero))
 
 
-def bell(value: jax.Array, peak: jax.Array | float, below: jax.Array | float, above: jax.Array | float) -> jax.Array:  # fmt: skip
+def bell(
+    value: jax.Array, peak: jax.Array | float, below: jax.Array | float, above: jax.Array | float
+) -> jax.Array:
     """exp(-((value - peak) / width)^2), with its own width on either side.
 
     Args:

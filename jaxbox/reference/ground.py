@@ -3,7 +3,7 @@
 import numpy as np
 from scipy import ndimage
 
-DIAGONAL_STEP = 1.414
+DIAGONAL_STEP = np.sqrt(2)
 """Diagonal neighbours are this many cells away."""
 WIDE_FACTOR = 4.0
 """The grid is filled where it is empty by a Gaussian this many times wider."""

@@ -1,0 +1,138 @@
+"""Argoverse 2 sensor data: sweeps, annotated boxes and ground flags.
+
+The data set's Feather tables are read after they have been written out plainly: the sweep's x, y, z and
+intensity as KITTI's binary points, the annotations as a JSON list of records with the table's own column
+names, the ground flags as one byte a point.
+
+All of them are in the vehicle's frame, whose origin is the middle of the rear axle. What a beam passed
+through on its way can only be told from the sensor, so everything is moved to the upper LiDAR's frame.
+
+Reference: Wilson et al., "Argoverse 2: Next generation datasets for self-driving perception and
+forecasting", NeurIPS Datasets and Benchmarks 2021.
+"""
+
+import json
+import os
+from typing import Any
+
+import numpy as np
+
+from jaxbox.io._files import InputError, read_bytes, read_text
+from jaxbox.io.labelled import LabelledBoxes, check_count, finite_number, labelled_boxes
+from jaxbox.io.points import read_bin
+
+SENSOR_XYZ_M = (1.35, 0.0, 1.64)
+"""The upper LiDAR in the vehicle's frame; cars of the fleet differ by centimetres."""
+
+CAR_CLASSES = frozenset({"REGULAR_VEHICLE"})
+"""Cars, with vans and pickups: the data set does not tell them apart."""
+
+VEHICLE_CLASSES = CAR_CLASSES | {
+    "ARTICULATED_BUS", "BOX_TRUCK", "BUS", "LARGE_VEHICLE", "MESSAGE_BOARD_TRAILER", "SCHOOL_BUS", "TRUCK",
+    "TRUCK_CAB", "VEHICULAR_TRAILER",
+}  # fmt: skip
+"""Everything on four wheels or more."""
+
+_CENTER = ("tx_m", "ty_m", "tz_m")
+_SIZE = ("length_m", "width_m", "height_m")
+_ROTATION = ("qw", "qx", "qy", "qz")
+_MIN_NORM = 0.5
+
+
+def read_argoverse2_points(
+    path: str | os.PathLike[str], *, sensor_xyz_m: tuple[float, float, float] = SENSOR_XYZ_M
+) -> tuple[np.ndarray, np.ndarray]:
+    """Reads a sweep and moves it to the sensor.
+
+    Args:
+      path: float32 x, y, z, intensity in the vehicle's frame, as `read_bin`.
+      sensor_xyz_m: where the sensor is in that frame.
+
+    Returns:
+      xyz: (n, 3) float32, m, sensor frame.
+      intensity: (n,) float32, 0 to 255.
+
+    Raises:
+      InputError: as `read_bin`.
+    """
+    xyz, intensity = read_bin(path)
+    return xyz - np.asarray(sensor_xyz_m, np.float32), intensity
+
+
+def read_argoverse2_boxes(
+    path: str | os.PathLike[str], *, sensor_xyz_m: tuple[float, float, float] = SENSOR_XYZ_M
+) -> LabelledBoxes:
+    """Reads the annotations of one sweep and moves them to the sensor.
+
+    Args:
+      path: a JSON list of records with category, tx_m, ty_m, tz_m, length_m, width_m, height_m and the
+        rotation qw, qx, qy, qz; other fields are ignored.
+      sensor_xyz_m: where the sensor is in the vehicle's frame.
+
+    Returns:
+      The boxes, in the file's order.
+
+    Raises:
+      InputError: naming file and entry, where it is no such list, or a field is missing or no number.
+    """
+    entries = _read_records(path)
+    named = [(entry, f"{path}, entry {index}") for index, entry in enumerate(entries)]
+    rotation = np.array([_rotation(*item) for item in named]).reshape(-1, 4)
+    w, x, y, z = rotation.T
+    return labelled_boxes(
+        [_category(*item) for item in named],
+        np.array([_fields(*item, _CENTER) for item in named]).reshape(-1, 3) - sensor_xyz_m,
+        np.array([_fields(*item, _SIZE) for item in named]),
+        # The turn about z of a rotation quaternion; boxes stand upright.
+        np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2)),
+    )
+
+
+def read_argoverse2_ground(path: str | os.PathLike[str], *, num_points: int | None = None) -> np.ndarray:
+    """Reads which points are on the ground of the data set's map.
+
+    Args:
+      path: one byte a point, 1 for ground and 0 for not.
+      num_points: points of the sweep, to check that the two belong together.
+
+    Returns:
+      (n,) bool.
+
+    Raises:
+      InputError: for another number of bytes, or a byte that is neither 0 nor 1.
+    """
+    flags = np.frombuffer(read_bytes(path), np.uint8)
+    check_count(path, len(flags), num_points, what="ground flags")
+    if flags.size and flags.max() > 1:
+        raise InputError(f"{path}: byte {int(np.argmax(flags > 1))} is {flags.max()}; flags are 0 or 1.")
+    return flags.astype(bool)
+
+
+def _read_records(path: str | os.PathLike[str]) -> list[Any]:
+    try:
+        entries = json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        raise InputError(f"{path}, line {error.lineno}: not JSON ({error.msg}).") from error
+    if not isinstance(entries, list):
+        raise InputError(f"{path}: holds no list; give the annotations as a JSON list of records.")
+    return entries
+
+
+def _category(entry: Any, where: str) -> str:
+    name = entry.get("category") if isinstance(entry, dict) else None
+    if not isinstance(name, str):
+        raise InputError(f"{where}: category is {name!r}; it must be a class name such as REGULAR_VEHICLE.")
+    return name
+
+
+def _fields(entry: Any, where: str, names: tuple[str, ...]) -> list[float]:
+    values = entry if isinstance(entry, dict) else {}
+    return [finite_number(values.get(name), name, where) for name in names]
+
+
+def _rotation(entry: Any, where: str) -> np.ndarray:
+    rotation = np.array(_fields(entry, where, _ROTATION))
+    norm = np.linalg.norm(rotation)
+    if norm < _MIN_NORM:
+        raise InputError(f"{where}: qw, qx, qy, qz are {rotation.tolist()}; a rotation has length 1.")
+    return rotation / norm

@@ -1,0 +1,144 @@
+"""From the boxes to the candidates: the score."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+
+from jaxbox import evidence, vehicles
+from jaxbox.config import DetectorConfig
+from jaxbox.geometry import wrap_yaw
+from jaxbox.masked import take
+from jaxbox.steps.boxes import cast_rays
+from jaxbox.steps.common import class_values, stage_options
+from jaxbox.steps.points import Heights, Obstacles, height_above_ground
+from jaxbox.steps.proposals import Proposals, Trials
+from jaxbox.types import NOT_A_BOX, Boxes
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Candidates:
+    """The trials that pass the gates, best score first: C rows."""
+
+    rectangle: jax.Array  # (C, 5) x, y, length, width, yaw
+    bottom: jax.Array  # (C,) m, sensor frame
+    height: jax.Array  # (C,) m
+    score: jax.Array  # (C,)
+    label: jax.Array  # (C,)
+    cluster: jax.Array  # (C,)
+    valid: jax.Array  # (C,)
+    num: jax.Array  # () true number
+
+
+def score_boxes(
+    trials: Trials,
+    boxes: Boxes,
+    proposals: Proposals,
+    obstacles: Obstacles,
+    heights: Heights,
+    seen: evidence.Evidence | None,
+    config: DetectorConfig,
+) -> Candidates:
+    """Scores the boxes by rays and size, then the best of them by what surrounds them."""
+    settings = config.vehicles
+    score = _early_score(trials, boxes, proposals, seen, config)
+    chosen, num = _best(score, settings.max_candidates, settings.min_score)
+    rectangle = jnp.concatenate(
+        [boxes.center, jnp.stack([boxes.length, boxes.width, wrap_yaw(boxes.yaw)], axis=1)], axis=1
+    )
+    rectangle = take(rectangle, chosen)
+    label, cluster = take(trials.label, chosen), take(trials.cluster, chosen, proposals.num_points.shape[0])
+    prior = functools.partial(class_values, config, label=label)
+    around = vehicles.count_points_around(
+        rectangle,
+        prior("count_max_height_m"),
+        num,
+        obstacles.xy,
+        obstacles.height,
+        obstacles.present,
+        **stage_options(config.region),
+        max_nearby=settings.max_nearby,
+        margin_m=settings.margin_m,
+        ring_m=settings.ring_m,
+    )
+    rho = jnp.linalg.norm(rectangle[:, :2], axis=1)
+    late = vehicles.surroundings_score(
+        around,
+        rho,
+        top_grade=settings.top_grade,
+        ring_weight=settings.ring_weight,
+        overhead_weight=settings.overhead_weight,
+        **{name: prior(name) for name in ("height_m", "height_tolerance_m", "min_height_m", "max_height_m")},
+    )
+    height = jnp.maximum(around.top + settings.top_margin_m, prior("min_box_height_m"))
+    above = jnp.zeros_like(height)
+    if config.completion.mode == "none":
+        # The paper keeps the height of the cluster itself.
+        above = take(proposals.min_height, cluster)
+        height = take(proposals.max_height, cluster) - above
+    flat = jnp.concatenate([rectangle[:, :2], jnp.zeros_like(rectangle[:, :1])], axis=1)
+    bottom = above - height_above_ground(flat, heights.planes, heights.surface, config)
+    total = jnp.where(chosen < score.shape[0], take(score, chosen) * late, 0)
+    order, final = _best(total, settings.max_candidates, settings.min_score)
+    unsorted = Candidates(
+        rectangle, bottom, height, total, label, cluster, total > settings.min_score, jnp.zeros_like(label)
+    )
+    ordered = jax.tree.map(lambda a: take(a, order), unsorted)
+    return dataclasses.replace(ordered, num=jnp.maximum(num, final))
+
+
+def _early_score(
+    trials: Trials,
+    boxes: Boxes,
+    proposals: Proposals,
+    seen: evidence.Evidence | None,
+    config: DetectorConfig,
+) -> jax.Array:
+    """(Q,) the part of the score that needs no look at the surroundings; no other part exceeds 1."""
+    settings = config.vehicles
+    prior = functools.partial(class_values, config, label=trials.label)
+    num_points = take(proposals.num_points, trials.cluster)
+    ones = jnp.ones_like(boxes.yaw)
+    hit, free_length, support = ones, 0 * ones, settings.support_points * ones
+    if seen is not None:
+        rays = cast_rays(boxes, trials.num, seen, config)
+        hit, free_length = rays.hit, rays.free_length
+        support = evidence.ground_support(seen, boxes.center)
+    score = vehicles.evidence_score(
+        num_points=num_points,
+        hit=hit,
+        free_length=free_length,
+        support=support,
+        objective=boxes.objective,
+        **{
+            name: getattr(settings, name)
+            for name in (
+                "saturation_points",
+                "sparseness_power",
+                "free_scale",
+                "support_points",
+                "objective_gate",
+                "objective_softness",
+            )
+        },
+    )
+    score = score * vehicles.size_score(
+        jnp.stack([boxes.length, boxes.width], axis=1),
+        jnp.stack([prior("length_m"), prior("width_m")], axis=1),
+        **{name: prior(name) for name in ("length_below_m", "length_above_m", "width_tolerance_m")},
+    )
+    present = (jnp.arange(score.shape[0]) < trials.num) & (boxes.objective > NOT_A_BOX)
+    return jnp.where(present & (jnp.max(boxes.measured, axis=1) >= settings.min_extent_m), score, 0)
+
+
+def _best(score: jax.Array, capacity: int, min_score: jax.Array | float) -> tuple[jax.Array, jax.Array]:
+    """Rows with the highest scores above the least, best first (ties by row), and their true number."""
+    size = score.shape[0]
+    above = score > min_score
+    _, order = jax.lax.sort((jnp.where(above, -score, 1), jnp.arange(size)), num_keys=1, is_stable=True)
+    num = jnp.sum(above)
+    row = jnp.arange(capacity)
+    order = jnp.pad(order, (0, max(capacity - size, 0)), constant_values=size)[:capacity]
+    return jnp.where(row < num, order, size), num
