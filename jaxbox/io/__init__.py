@@ -1,6 +1,7 @@
-"""Files in and out: KITTI's formats and folder layouts, plain points, images, JSON Lines."""
+"""Files in and out: KITTI's formats and folder layouts, other data sets, plain points, images, JSON Lines."""
 
 from jaxbox.io._files import InputError, atomic_path, atomic_writer
+from jaxbox.io.argoverse2 import read_argoverse2_boxes, read_argoverse2_ground, read_argoverse2_points
 from jaxbox.io.images import read_image
 from jaxbox.io.jsonl import detections_record, read_jsonl, write_jsonl
 from jaxbox.io.kitti import (
@@ -13,12 +14,16 @@ from jaxbox.io.kitti import (
     read_raw_calibration,
     write_labels,
 )
+from jaxbox.io.labelled import LabelledBoxes
+from jaxbox.io.pandaset import read_pandaset_boxes, read_pandaset_points
 from jaxbox.io.points import read_bin, read_points, read_text_points, write_bin
+from jaxbox.io.semantic_kitti import read_semantic_labels
 from jaxbox.io.sweeps import Sweep, open_sweeps
 
 __all__ = [
     "InputError",
     "KittiObject",
+    "LabelledBoxes",
     "Sweep",
     "atomic_path",
     "atomic_writer",
@@ -26,14 +31,20 @@ __all__ = [
     "detections_record",
     "objects_from_detections",
     "open_sweeps",
+    "read_argoverse2_boxes",
+    "read_argoverse2_ground",
+    "read_argoverse2_points",
     "read_bin",
     "read_calibration",
     "read_image",
     "read_jsonl",
     "read_label_folder",
     "read_labels",
+    "read_pandaset_boxes",
+    "read_pandaset_points",
     "read_points",
     "read_raw_calibration",
+    "read_semantic_labels",
     "read_text_points",
     "write_bin",
     "write_jsonl",
