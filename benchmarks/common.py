@@ -1,0 +1,176 @@
+"""What the benchmarks share: where the data is, which settings, what a report says of its circumstances."""
+
+import argparse
+import ast
+import dataclasses
+import importlib.metadata
+import json
+import os
+import pathlib
+import platform
+import subprocess
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+import jaxbox
+from jaxbox import Detections, DetectorConfig, PointCloud, Status
+from jaxbox.cli.cache import enable_cache
+from jaxbox.io import atomic_writer
+
+PROJECT = pathlib.Path(__file__).resolve().parents[1]
+
+DATA_VARIABLE = "JAXBOX_DATA"
+"""Environment variable that names the folder of real sweeps; by default ``../shared/data``."""
+
+PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "opencv-python-headless")
+
+
+def data_folder(name: str) -> pathlib.Path:
+    """One data set's folder; ends the program, saying how to go on, where it is absent."""
+    root = pathlib.Path(os.environ.get(DATA_VARIABLE, PROJECT.parent / "shared" / "data"))
+    if not (root / name).is_dir():
+        raise SystemExit(f"{root / name} is not a folder; set {DATA_VARIABLE} to the folder of real sweeps.")
+    return root / name
+
+
+def parser(description: str) -> argparse.ArgumentParser:
+    """A parser with the options of every benchmark."""
+    options = argparse.ArgumentParser(description=description)
+    options.add_argument("--preset", choices=sorted(DetectorConfig.presets()), default="default")
+    options.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="FIELD=VALUE",
+        help="change one setting, such as vehicles.max_overlap=0.2 or clustering.maps.0.cell_m=0.3",
+    )
+    options.add_argument("--json", type=pathlib.Path, help="also write the report to this file")
+    return options
+
+
+def chosen_config(options: argparse.Namespace) -> DetectorConfig:
+    """The preset with its changes; also switches the compilation cache on."""
+    enable_cache()
+    config = DetectorConfig.presets()[options.preset]
+    for change in options.set:
+        config = override(config, change)
+    return config
+
+
+def override(config: DetectorConfig, change: str) -> DetectorConfig:
+    """Changes one setting.
+
+    Args:
+      config: the settings.
+      change: ``field=value``; the field is a dotted path, with numbers into tuples, the value a Python
+        literal, or else a word.
+
+    Returns:
+      The changed settings.
+
+    Raises:
+      SystemExit: naming the path, where there is no such setting.
+
+    >>> override(DetectorConfig(), "clustering.maps.1.cell_m=0.3").clustering.maps[1].cell_m
+    0.3
+    """
+    path, separator, text = change.partition("=")
+    if not separator:
+        raise SystemExit(f"--set {change}: write it as FIELD=VALUE.")
+    try:
+        value = ast.literal_eval(text)
+    except (ValueError, SyntaxError):
+        value = text
+    try:
+        return _replaced(config, path.split("."), value)
+    except (AttributeError, IndexError, TypeError, ValueError) as error:
+        raise SystemExit(f"--set {change}: there is no setting {path}; see jaxbox/config.py.") from error
+
+
+def _replaced(node: Any, path: Sequence[str], value: Any) -> Any:
+    if not path:
+        return value
+    step, rest = path[0], path[1:]
+    if isinstance(node, tuple):
+        index = int(step)
+        return (*node[:index], _replaced(node[index], rest, value), *node[index + 1 :])
+    return dataclasses.replace(node, **{step: _replaced(getattr(node, step), rest, value)})
+
+
+def detect(xyz: np.ndarray, intensity: np.ndarray | None, config: DetectorConfig) -> Detections:
+    """Finds the vehicles of one sweep, on the host's side of the API."""
+    return jax.block_until_ready(jaxbox.detect(PointCloud.from_numpy(xyz, intensity), config))
+
+
+def status_names(statuses: Sequence[int]) -> list[str]:
+    """Names of all status bits that are set in any sweep."""
+    together = Status(int(np.bitwise_or.reduce(np.array([0, *statuses]))))
+    return [bit.name or "" for bit in Status if bit and bit in together]
+
+
+def circumstances(options: argparse.Namespace) -> dict[str, Any]:
+    """What a figure depends on beside the code: settings, commit, versions and machine."""
+    chosen = {
+        name: str(value) if isinstance(value, pathlib.Path) else value
+        for name, value in vars(options).items()
+    }
+    return {
+        "options": chosen,
+        "commit": _git("rev-parse", "HEAD"),
+        "uncommitted_changes": bool(_git("status", "--porcelain", "--", "jaxbox", "benchmarks")),
+        "jaxbox": jaxbox.__version__,
+        "python": platform.python_version(),
+        "packages": {name: installed_version(name) for name in PACKAGES},
+        "machine": platform.machine(),
+        "processor": _processor(),
+        "cpus": os.cpu_count(),
+        "devices": [str(device) for device in jax.devices()],
+    }
+
+
+def _git(*words: str) -> str | None:
+    done = subprocess.run(["git", *words], cwd=PROJECT, capture_output=True, text=True, check=False)
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def _processor() -> str:
+    cpuinfo = pathlib.Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
+    return next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), "unknown")
+
+
+def installed_version(name: str) -> str | None:
+    """Version of a package, or None where it is not installed."""
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def write_report(report: dict[str, Any], options: argparse.Namespace) -> None:
+    """Writes the report where ``--json`` says, whole or not at all."""
+    if options.json:
+        with atomic_writer(options.json) as handle:
+            json.dump(report | {"circumstances": circumstances(options)}, handle, indent=1)
+
+
+def print_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
+    """Prints aligned columns; floats with three significant decimals at most."""
+    texts = [[_cell(value) for value in row] for row in [header, *rows]]
+    widths = [max(len(row[i]) for row in texts) for i in range(len(header))]
+    for row in texts:
+        print(
+            "  ".join(
+                text.rjust(width) if i else text.ljust(width)
+                for i, (text, width) in enumerate(zip(row, widths, strict=True))
+            )
+        )
+
+
+def _cell(value: object) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
