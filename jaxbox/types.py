@@ -56,8 +56,9 @@ _STATUS_TEXT = {
     "the points a box is fitted to, box.max_slab_points); the last in the sweep's order were dropped.",
     Status.CELL_OVERFLOW: "a component map has more occupied cells than its max_cells; "
     "points in the cells beyond it belong to no cluster.",
-    Status.CLUSTER_OVERFLOW: "a component map has more clusters than its max_clusters; "
-    "the ones beyond it were not examined.",
+    Status.CLUSTER_OVERFLOW: "a component map has more clusters than its max_clusters, and those beyond it "
+    "were not examined; or more clusters are high than vehicles.max_large, and those beyond it were "
+    "tried as cars only.",
     Status.CANDIDATE_OVERFLOW: "more boxes passed the gates than vehicles.max_candidates; "
     "the lowest-scoring were dropped.",
     Status.DETECTION_OVERFLOW: "more detections than vehicles.max_detections; "
@@ -318,6 +319,9 @@ class Counts:
     """(maps,) int32: occupied cells of each component map."""
     clusters: jax.Array
     """(maps,) int32: clusters of each map that pass the size gates."""
+    large_clusters: jax.Array
+    """() int32: clusters of all maps that are tried as a van and a truck too, which vehicles.max_large
+    must hold."""
     candidates: jax.Array
     """() int32: boxes that pass the gates, before suppression."""
     detections: jax.Array
@@ -399,7 +403,11 @@ def _overflow_text(bit: Status, counts: Counts) -> str:
     if bit in per_map:
         field, needed = per_map[bit]
         sizes = ", ".join(str(int(n)) for n in np.asarray(needed))
-        return f"{bit.name}: clustering.maps[i].{field} must be at least {sizes} (one number a map)."
+        large = f" and vehicles.max_large at least {int(counts.large_clusters)}"
+        return (
+            f"{bit.name}: clustering.maps[i].{field} must be at least {sizes} (one number a map)"
+            f"{large if bit is Status.CLUSTER_OVERFLOW else ''}."
+        )
     if bit is Status.OBSTACLE_OVERFLOW:
         return (
             f"{bit.name}: clustering.max_obstacles must be at least {int(counts.obstacles)} "

@@ -129,6 +129,9 @@ def detect(xyz: np.ndarray, config: DetectorConfig | None = None, seed: int = 0)
         "overhead_points": int(is_overhead.sum()),
         "dropped_obstacles": len(obstacle_rows) - len(obstacles.rows),
         **_cluster_counts(obstacles, maps, settings),
+        "large_clusters": sum(
+            p.top_m > settings.vehicles.large_height_m for of_map in proposals for p in of_map
+        ),
         "obstacles": len(obstacle_rows),
         "candidates": len(candidates),
         "detections": len(rows),

@@ -118,6 +118,7 @@ def _counts(
         slab_points=proposals.num_slab,
         cells=jnp.stack([m.num_cells for m in proposals.maps]),
         clusters=jnp.stack([m.num_clusters for m in proposals.maps]),
+        large_clusters=proposals.num_large,
         candidates=candidates.num,
         detections=num_detections,
         hull_vertices=jnp.max(num_vertices),
@@ -145,7 +146,7 @@ def _status(
         | (counts.slab_points > max_slab_points(capacity, config)),
         Status.CELL_OVERFLOW: jnp.any(counts.cells > max_cells),
         Status.CLUSTER_OVERFLOW: jnp.any(counts.clusters > max_clusters)
-        | (proposals.num_large > settings.max_large),
+        | (counts.large_clusters > settings.max_large),
         Status.CANDIDATE_OVERFLOW: counts.candidates > settings.max_candidates,
         Status.DETECTION_OVERFLOW: counts.detections > settings.max_detections,
         Status.HULL_OVERFLOW: counts.hull_vertices > config.hull.max_vertices,
