@@ -30,7 +30,10 @@ def _config(cls: type[_T]) -> type[_T]:
 
 @_config
 class RegionConfig:
-    """The part of the world that is looked at; points outside are counted and left out."""
+    """The part of the world that is looked at; points outside are counted and left out.
+
+    So are points 100 m or more above or below the sensor.
+    """
 
     half_x_m: float = _static(default=80.0)
     """static: |x| below this."""

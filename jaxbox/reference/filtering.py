@@ -3,6 +3,9 @@
 import numpy as np
 from scipy import ndimage
 
+MAX_ABS_Z_M = 100.0
+"""No road or vehicle in range of the sensor is so far above or below it."""
+
 
 def select_points(xyz: np.ndarray, *, half_x_m: float, half_y_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Tells which points are finite, and which of those lie within the region.
@@ -10,13 +13,14 @@ def select_points(xyz: np.ndarray, *, half_x_m: float, half_y_m: float) -> tuple
     Args:
       xyz: (n, 3) m, sensor frame; NaN and infinity allowed.
       half_x_m: the region is |x| below this.
-      half_y_m: the region is |y| below this.
+      half_y_m: the region is |y| below this, and |z| below 100 m.
 
     Returns:
       finite (n,) bool and valid (n,) bool, the finite points within the region.
     """
     finite = np.isfinite(xyz).all(axis=1).astype(bool)
     within = (np.abs(xyz[:, 0]) < half_x_m) & (np.abs(xyz[:, 1]) < half_y_m)
+    within &= np.abs(xyz[:, 2]) < MAX_ABS_Z_M
     return finite, finite & within
 
 

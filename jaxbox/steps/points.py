@@ -11,6 +11,10 @@ from jaxbox.masked import compact, take
 from jaxbox.steps.common import stage_options
 from jaxbox.types import GroundPlane, PointCloud
 
+MAX_ABS_Z_M = 100.0
+"""Points farther above or below the sensor are faults: one alone would stretch the spread of the whole
+sweep, by which outliers are told, and beyond 1e19 m its square overflows."""
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -30,7 +34,7 @@ def select_points(cloud: PointCloud, config: DetectorConfig) -> Sweep:
     region = stage_options(config.region)
     xyz, present = cloud.xyz1[:, :3], cloud.xyz1[:, 3] > 0
     finite = present & jnp.all(jnp.isfinite(xyz), axis=1)
-    valid = finite & jnp.all(jnp.abs(xyz[:, :2]) < jnp.array([*region.values()]), axis=1)
+    valid = finite & jnp.all(jnp.abs(xyz) < jnp.array([*region.values(), MAX_ABS_Z_M]), axis=1)
     xyz = jnp.where(valid[:, None], xyz, 0)
     inlier = valid
     if config.filtering.enabled:
