@@ -1,0 +1,159 @@
+"""Laws of the fixed-shape toolbox, against NumPy at every awkward size."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbox import masked
+
+SIZES = (1, 2, masked.BLOCK - 1, masked.BLOCK, masked.BLOCK + 1, 3 * masked.BLOCK + 7)
+
+# Compiled whole: run step by step, each step of each size would compile alone.
+prefix_sum = jax.jit(masked.prefix_sum)
+compact = jax.jit(masked.compact, static_argnums=1)
+group_by = jax.jit(masked.group_by, static_argnums=1)
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("kind", ["bool", "int32"])
+def test_prefix_sum_is_the_cumulative_sum(size, kind):
+    rng = np.random.default_rng(size)
+    values = rng.integers(0, 2, size).astype(bool) if kind == "bool" else rng.integers(-9, 9, size)
+    total = prefix_sum(jnp.asarray(values, kind))
+    assert total.dtype == jnp.int32
+    np.testing.assert_array_equal(total, np.cumsum(values))
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_compact_lists_the_true_entries_in_order_and_then_the_sentinel(size):
+    for density in (0.0, 0.3, 1.0):
+        mask = np.random.default_rng(size).random(size) < density
+        index, count = compact(mask, size + 3)
+        expected = np.flatnonzero(mask)
+        assert int(count) == len(expected)
+        np.testing.assert_array_equal(index, np.append(expected, np.full(size + 3 - len(expected), size)))
+
+
+@pytest.mark.parametrize("capacity", [1, 2, 40])
+def test_compact_keeps_the_first_entries_and_reports_the_true_count(capacity):
+    mask = np.random.default_rng(1).random(600) < 0.5
+    index, count = compact(jnp.asarray(mask), capacity)
+    assert int(count) == mask.sum() > capacity
+    np.testing.assert_array_equal(index, np.flatnonzero(mask)[:capacity])
+
+
+def test_take_reads_rows_and_fills_those_that_are_absent():
+    rows = jnp.arange(12.0).reshape(4, 3)
+    picked = masked.take(rows, jnp.array([[3, 0], [4, 99]]))
+    np.testing.assert_array_equal(picked, [[[9, 10, 11], [0, 1, 2]], [[0, 0, 0], [0, 0, 0]]])
+    filled = masked.take(jnp.array([5, 6]), jnp.array([2, 1]), -7)
+    assert filled.tolist() == [-7, 6]
+    assert filled.dtype == jnp.int32
+    assert masked.take(jnp.array([False, True]), jnp.array([1, 2])).tolist() == [True, False]
+
+
+def test_take_after_compact_gathers_and_a_drop_scatter_puts_back():
+    mask = jnp.asarray(np.random.default_rng(2).random(50) < 0.4)
+    values = jnp.arange(50.0) + 1
+    index, _ = compact(mask, 64)
+    back = jnp.zeros(50).at[index].set(masked.take(values, index), mode="drop")
+    np.testing.assert_array_equal(back, jnp.where(mask, values, 0))
+
+
+@pytest.mark.parametrize("offset", [0.0, 1000.0])
+def test_masked_mean_and_deviation_equal_numpy_over_the_masked_values(offset):
+    rng = np.random.default_rng(3)
+    values = (offset + rng.normal(size=(5, 200))).astype(np.float32)
+    mask = rng.random((5, 200)) < np.array([[0.0], [0.02], [0.5], [0.9], [1.0]])
+    mask[1, 7] = True
+    mean, std = masked.masked_mean(values, mask), masked.masked_std(values, mask)
+    assert float(mean[0]) == float(std[0]) == 0
+    for row in range(1, 5):
+        kept = values[row, mask[row]].astype(np.float64)
+        np.testing.assert_allclose(mean[row], kept.mean(), rtol=1e-6, atol=1e-6)
+        # In float32 values near 1000 are 6e-5 apart.
+        np.testing.assert_allclose(std[row], kept.std(), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("chunk", [1, 4, 16])
+def test_map_rows_equals_the_function_on_all_rows_and_zero_beyond_the_last_chunk(chunk):
+    rows = {"a": jnp.arange(1.0, 11), "b": jnp.ones((10, 2), jnp.int32)}
+
+    def function(row):
+        assert row["a"].shape == (chunk,)
+        return row["a"][:, None] * row["b"], row["a"] > 3
+
+    mapped = jax.jit(lambda num_rows: masked.map_rows(function, rows, num_rows=num_rows, chunk=chunk))
+    values = np.arange(1.0, 11)
+    for num_rows in (0, 1, 4, 5, 9, 10, 99):
+        product, large = mapped(num_rows)
+        done = np.arange(10) < -(-min(num_rows, 10) // chunk) * chunk
+        np.testing.assert_array_equal(product, np.where(done, values, 0)[:, None] * np.ones(2))
+        np.testing.assert_array_equal(large, done & (values > 3))
+
+
+def grouped(group, num_groups):
+    order, start = group_by(np.asarray(group, np.int32), num_groups)
+    return np.asarray(order), np.asarray(start)
+
+
+# 12 + 21 bits and 20 + 13 bits do not fit one word: those sort a key with its value.
+@pytest.mark.parametrize(
+    ("size", "num_groups"),
+    [(1, 1), (2, 1), (100, 7), (3000, 3000), (4095, 2**20 - 1), (4096, 2**20), (2**19, 2**12)],
+)
+def test_group_by_is_a_stable_sort_with_the_rows_of_no_group_last(size, num_groups):
+    rng = np.random.default_rng(size)
+    group = rng.integers(0, min(num_groups, 40) + 1, size) * (num_groups // min(num_groups, 40))
+    group = np.minimum(group, num_groups)
+    order, start = grouped(group, num_groups)
+    np.testing.assert_array_equal(order, np.argsort(group, kind="stable"))
+    np.testing.assert_array_equal(start, np.searchsorted(np.sort(group), np.arange(num_groups + 1)))
+
+
+def test_both_sorts_of_group_by_are_tried_above():
+    def packed(size, num_groups):
+        return size.bit_length() + num_groups.bit_length() <= masked.WORD_BITS
+
+    assert packed(4095, 2**20 - 1)
+    assert not packed(4096, 2**20)
+    assert not packed(2**19, 2**12)
+
+
+@pytest.mark.parametrize("all_in", [0, 5])
+def test_group_by_of_one_group_or_none_keeps_the_order(all_in):
+    order, start = grouped(np.full(9, all_in), 5)
+    assert order.tolist() == list(range(9))
+    assert start.tolist() == ([0, 9, 9, 9, 9, 9] if all_in == 0 else [0] * 6)
+
+
+def test_fold_points_sees_each_point_of_each_cluster_once_and_in_order():
+    points = np.random.default_rng(4).normal(size=(3, 6, 2)).astype(np.float32)
+
+    def update(state, x, y):
+        total, last = state
+        return total + jnp.concatenate([x, y], axis=1), jnp.broadcast_to(x, last.shape)
+
+    fold = jax.jit(lambda counts: masked.fold_points(jnp.asarray(points), counts, init, update))
+    init = jnp.zeros((3, 2)), jnp.full((3, 1), 7.0)
+    for counts in ([0, 0, 0], [1, 0, 6], [6, 6, 6], [2, 9, 3]):
+        total, last = fold(jnp.array(counts))
+        for cluster, count in enumerate(np.minimum(counts, 6)):
+            np.testing.assert_allclose(total[cluster], points[cluster, :count].sum(axis=0), atol=1e-5)
+            assert float(last[cluster, 0]) == (points[cluster, count - 1, 0] if count else 7.0)
+
+
+def test_the_toolbox_gives_the_same_under_jit_and_vmap():
+    masks = jnp.asarray(np.random.default_rng(5).random((4, 700)) < 0.3)
+
+    def both(mask):
+        index, count = masked.compact(mask, 64)
+        order, start = masked.group_by(jnp.where(mask, 1, 2), 2)
+        return index, count, order, start
+
+    singles = [both(mask) for mask in masks]
+    for batch in (jax.vmap(both)(masks), jax.jit(jax.vmap(both))(masks)):
+        for row, single in enumerate(singles):
+            for one, other in zip(single, batch, strict=True):
+                np.testing.assert_array_equal(one, other[row])
