@@ -33,6 +33,7 @@ MIN_POINTS = 30
 MAX_RANGE_M = 40.0
 """Labels nearer than this with so many points are to be found."""
 RECALL_OVERLAP = 0.5
+REPEATED_OVERLAP = 0.9
 TRUE_OVERLAPS = (0.1, 0.3, 0.5)
 """A detection is right where it overlaps a vehicle's label so much: found at all, in its place, well."""
 SCORE_CUTS = (0.01, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)
@@ -103,6 +104,7 @@ def measure(sweep: LabelledSweep, found: Detections) -> dict[str, Any]:
     overlap, _ = pairwise_overlaps(_rows(boxes.center, boxes.size, boxes.yaw), _rows(center, size, yaw))
     num_points = count_points_in_boxes(sweep.xyz, boxes.center, boxes.size, boxes.yaw)
     wanted = (num_points >= MIN_POINTS) & (np.hypot(*boxes.center[:, :2].T) <= MAX_RANGE_M)
+    wanted &= ~_repeated(boxes)
     best = overlap[sweep.is_vehicle].max(axis=0, initial=0)
     return {
         "sweep": sweep.name,
@@ -116,6 +118,13 @@ def measure(sweep: LabelledSweep, found: Detections) -> dict[str, Any]:
         "sensor_height_m": -float(found.ground.coefficients[2]),
         "status": common.status_names([int(found.status)]),
     }
+
+
+def _repeated(boxes: LabelledBoxes) -> np.ndarray:
+    """(n,) bool: labels that an earlier one covers; some objects are labelled twice, as two tracks."""
+    rows = _rows(boxes.center, boxes.size, boxes.yaw)
+    overlap, _ = pairwise_overlaps(rows, rows)
+    return np.any(np.tril(overlap, k=-1) >= REPEATED_OVERLAP, axis=1)
 
 
 def _rows(center: np.ndarray, size: np.ndarray, yaw: np.ndarray) -> np.ndarray:
