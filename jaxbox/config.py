@@ -55,7 +55,7 @@ class FilterConfig:
     """static: mean shift iterations."""
     bandwidth_m: Scalar = 1.0
     """Standard deviation of the Gaussian window that weighs the neighbouring cells."""
-    num_std: Scalar = 4.0
+    num_std: Scalar = 8.0
     """t: a point farther from its converged centroid than mean + t standard deviations is an outlier."""
     min_density: Scalar = 1.1
     """Points whose window holds a smaller weight are outliers: a point alone in it weighs 1."""
@@ -80,7 +80,7 @@ class GroundConfig:
     """static: rounds; each removes the inliers of its plane (Algorithm I, "repeat")."""
     num_refits: int = _static(default=3)
     """static: refits of the best plane on all its inliers."""
-    tolerance_m: Scalar = 0.2
+    tolerance_m: Scalar = 0.1
     """A candidate within this of a plane is an inlier."""
     max_slope_deg: Scalar = 12.0
     """Steeper planes are no ground."""
@@ -153,7 +153,7 @@ class ClusteringConfig:
     """static: capacity for points above the ground; None is 3/4 of the cloud's capacity."""
     adaptive_start_m: Scalar = 20.0
     """Range from which the linking distance grows."""
-    adaptive_growth: Scalar = 0.01
+    adaptive_growth: Scalar = 0.005
     """Growth of the linking distance with range beyond the start, per metre; 0 keeps it fixed."""
     min_points: Scalar = 8.0
     """Clusters with fewer points are left out."""
@@ -290,6 +290,8 @@ class ClassPrior:
     """Wider measured extents are no such vehicle."""
     min_box_height_m: Scalar
     """Boxes are at least so high: their tops read low."""
+    prior_weight: Scalar
+    """Factor of the score: how common the class is beside the car, softened."""
     count_max_height_m: Scalar
     """Points lower than this above the ground belong to the vehicle; higher ones within the box
     speak against it."""
@@ -309,6 +311,7 @@ CAR = ClassPrior(
     max_length_m=6.5,
     max_width_m=2.4,
     min_box_height_m=1.48,
+    prior_weight=1.0,
     count_max_height_m=2.0,
 )
 VAN = ClassPrior(
@@ -319,11 +322,12 @@ VAN = ClassPrior(
     length_above_m=1.5,
     width_tolerance_m=0.3,
     height_tolerance_m=0.35,
-    min_height_m=1.7,
+    min_height_m=2.0,
     max_height_m=2.7,
     max_length_m=7.5,
     max_width_m=2.6,
     min_box_height_m=1.8,
+    prior_weight=0.5,
     count_max_height_m=2.7,
 )
 TRUCK = ClassPrior(
@@ -339,6 +343,7 @@ TRUCK = ClassPrior(
     max_length_m=18.0,
     max_width_m=3.2,
     min_box_height_m=2.6,
+    prior_weight=0.3,
     count_max_height_m=4.0,
 )
 
@@ -351,6 +356,8 @@ class VehicleConfig:
     """Priors of car, van and truck."""
     large_height_m: Scalar = 1.7
     """Clusters higher than this are also tried as a van or a truck."""
+    large_clearance_m: Scalar = 0.8
+    """Clusters that begin higher than this above the ground are not: they are trees, say."""
     max_large: int = _static(default=512)
     """static: capacity for clusters also tried as a van or a truck."""
     max_candidates: int = _static(default=512)

@@ -129,6 +129,7 @@ def _early_score(
         jnp.stack([prior("length_m"), prior("width_m")], axis=1),
         **{name: prior(name) for name in ("length_below_m", "length_above_m", "width_tolerance_m")},
     )
+    score = score * prior("prior_weight")
     present = (jnp.arange(score.shape[0]) < trials.num) & (boxes.objective > NOT_A_BOX)
     return jnp.where(present & (jnp.max(boxes.measured, axis=1) >= settings.min_extent_m), score, 0)
 

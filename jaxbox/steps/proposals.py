@@ -85,7 +85,10 @@ def _list_proposals(maps: tuple[Clusters, ...], obstacles: Obstacles, config: De
         return joined
 
     max_height = join("max_height")
-    large, num_large = compact(max_height > config.vehicles.large_height_m, config.vehicles.max_large)
+    min_height = join("min_height")
+    settings = config.vehicles
+    is_large = (max_height > settings.large_height_m) & (min_height < settings.large_clearance_m)
+    large, num_large = compact(is_large, settings.max_large)
     fitted = _fitted(cluster, obstacles, total, config)
     num_slab = jnp.max(jnp.sum(fitted, axis=1))
     return Proposals(
@@ -94,7 +97,7 @@ def _list_proposals(maps: tuple[Clusters, ...], obstacles: Obstacles, config: De
         sum(kept, jnp.int32(0)),
         kept[0],
         join("num_points"),
-        join("min_height"),
+        min_height,
         max_height,
         fitted,
         num_slab,
