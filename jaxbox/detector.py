@@ -1,5 +1,7 @@
 """detect(): from a sweep to vehicle boxes, as one compiled function. Wiring only."""
 
+from typing import Any
+
 import jax
 
 from jaxbox import steps
@@ -26,9 +28,14 @@ def detect(
 
     Reference: paper, section 3; oracle `jaxbox.reference.detect`.
     """
-    config = DetectorConfig() if config is None else config
+    config = jax.tree.map(_as_float, DetectorConfig() if config is None else config)
     key = jax.random.key(0) if key is None else key
     return _detect_jit(cloud, config, key)
+
+
+def _as_float(threshold: Any) -> Any:
+    # jit tells 8 from 8.0 and from a NumPy scalar, and would compile again for each.
+    return threshold if isinstance(threshold, jax.Array) else float(threshold)
 
 
 # A batch runs its sweeps one after the other: on a CPU, batched scatters, and loops that end with the
