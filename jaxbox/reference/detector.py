@@ -23,6 +23,7 @@ from jaxbox.reference.proposals import (
     Obstacles,
     find_clusters,
     index_obstacles,
+    is_large,
     judge_candidates,
     make_proposals,
     select_options,
@@ -129,9 +130,7 @@ def detect(xyz: np.ndarray, config: DetectorConfig | None = None, seed: int = 0)
         "overhead_points": int(is_overhead.sum()),
         "dropped_obstacles": len(obstacle_rows) - len(obstacles.rows),
         **_cluster_counts(obstacles, maps, settings),
-        "large_clusters": sum(
-            p.top_m > settings.vehicles.large_height_m for of_map in proposals for p in of_map
-        ),
+        "large_clusters": sum(is_large(p, settings) for of_map in proposals for p in of_map),
         "obstacles": len(obstacle_rows),
         "candidates": len(candidates),
         "detections": len(rows),
@@ -216,16 +215,17 @@ def _vertical(
     candidate: Candidate, obstacles: Obstacles, ground: _Ground, settings: Any
 ) -> tuple[float, float]:
     """Middle and height of a box along z."""
-    z = obstacles.xyz[candidate.proposal.members, 2]
-    if settings.completion.mode == "none":
-        return (z.min() + z.max()) / 2, z.max() - z.min()
-    vehicles = settings.vehicles
-    prior = vehicles.classes[candidate.label]
-    height = max(candidate.around.top_m + vehicles.top_margin_m, prior.min_box_height_m)
     # z tells which of several planes the vehicle stands on.
-    place = np.append(candidate.completed.box[:2], z.min())[None]
+    z = obstacles.xyz[candidate.proposal.members, 2].min()
     options = _surface_grid(settings) | select_options(settings.ground, "min_height_m")
-    return ground_elevation(place, ground.planes, ground.grid, **options)[0] + height / 2, height
+    place = np.append(candidate.completed.box[:2], z)[None]
+    ground_z = ground_elevation(place, ground.planes, ground.grid, **options)[0]
+    if settings.completion.mode == "none":
+        bottom, top = candidate.proposal.bottom_m, candidate.proposal.top_m
+        return ground_z + (bottom + top) / 2, top - bottom
+    prior = settings.vehicles.classes[candidate.label]
+    height = max(candidate.around.top_m + settings.vehicles.top_margin_m, prior.min_box_height_m)
+    return ground_z + height / 2, height
 
 
 def _assemble(

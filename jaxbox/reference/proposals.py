@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from jaxbox.config import ClassPrior, ComponentMap
-from jaxbox.reference.boxes import criterion_curve, fit_points
+from jaxbox.reference.boxes import convex_hull, criterion_curve, fit_points
 from jaxbox.reference.clusters import NO_CLUSTER, grid_cells, keep_clusters, label_components, warp_range
 from jaxbox.reference.completion import CompletedBox, complete_box, direction_preference, scene_direction
 from jaxbox.reference.evidence import Evidence, box_evidence, support_at
@@ -41,6 +41,8 @@ class Proposal:
     """(A,): criterion at each rotation."""
     extents: np.ndarray
     """(A, 4) m: see `criterion_curve`."""
+    bottom_m: float
+    """Height of its lowest member above the ground."""
     top_m: float
     """Height of its highest member above the ground."""
 
@@ -128,25 +130,47 @@ def make_proposals(obstacles: Obstacles, slot: np.ndarray, settings: Any) -> lis
     Returns:
       One proposal a cluster, in the order of the clusters.
     """
-    box = settings.box
     order = np.argsort(slot, kind="stable")
     order = order[slot[order] != NO_CLUSTER]
     starts = np.flatnonzero(np.diff(slot[order])) + 1
     proposals = []
     for members in np.split(order, starts) if len(order) else []:
-        chosen = fit_points(
-            members,
-            obstacles.height,
-            min_height_m=box.slab_min_height_m,
-            max_height_m=box.slab_max_height_m,
-            **select_options(box, "min_slab_points", "max_points"),
-        )
-        xy = obstacles.xyz[chosen, :2]
+        xy = _outline(members, obstacles, settings)
         curve, extents = criterion_curve(
-            xy, **select_options(box, "criterion", "num_angles", "min_distance_m")
+            xy, **select_options(settings.box, "criterion", "num_angles", "min_distance_m")
         )
-        proposals.append(Proposal(members, xy, curve, extents, float(obstacles.height[members].max())))
+        height = obstacles.height[members]
+        proposals.append(Proposal(members, xy, curve, extents, float(height.min()), float(height.max())))
     return proposals
+
+
+def _outline(members: np.ndarray, obstacles: Obstacles, settings: Any) -> np.ndarray:
+    """(j, 2) m: the points of a cluster that its rectangle is fitted to."""
+    box = settings.box
+    if box.fit_to == "hull":
+        return convex_hull(obstacles.xyz[members, :2])
+    chosen = fit_points(
+        members,
+        obstacles.height,
+        min_height_m=box.slab_min_height_m,
+        max_height_m=box.slab_max_height_m,
+        **select_options(box, "min_slab_points", "max_points"),
+    )
+    return obstacles.xyz[chosen, :2]
+
+
+def is_large(proposal: Proposal, settings: Any) -> bool:
+    """Whether a cluster is tried as a van and a truck too: high, and standing on the ground.
+
+    Args:
+      proposal: the cluster.
+      settings: of the detector.
+
+    Returns:
+      True for those.
+    """
+    vehicles = settings.vehicles
+    return proposal.top_m > vehicles.large_height_m and proposal.bottom_m < vehicles.large_clearance_m
 
 
 def _complete(
@@ -211,7 +235,7 @@ def judge_candidates(
     vehicles = settings.vehicles
     preference = _preference(proposals[0], evidence, settings)
     every = [proposal for of_map in proposals for proposal in of_map]
-    large = [p for p in every if p.top_m > vehicles.large_height_m][: vehicles.max_large]
+    large = [p for p in every if is_large(p, settings)][: vehicles.max_large]
     candidates = []
     for label, chosen in ((Label.CAR, every), (Label.VAN, large), (Label.TRUCK, large)):
         prior = vehicles.classes[label]
