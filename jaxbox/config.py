@@ -112,7 +112,7 @@ class GroundConfig:
     """Standard deviation of the Gaussian that smooths the ground grid (and fills it, 4 x wider)."""
     min_height_m: Scalar = 0.2
     """A point higher above the ground than this is an obstacle; others are ground."""
-    max_height_m: Scalar = 4.0
+    max_height_m: Scalar = 4.5
     """A point higher above the ground than this is overhead, and left out."""
 
 
@@ -339,12 +339,12 @@ TRUCK = ClassPrior(
     width_tolerance_m=0.4,
     height_tolerance_m=0.8,
     min_height_m=2.4,
-    max_height_m=4.0,
+    max_height_m=4.2,
     max_length_m=18.0,
     max_width_m=3.2,
     min_box_height_m=2.6,
     prior_weight=0.3,
-    count_max_height_m=4.0,
+    count_max_height_m=4.2,
 )
 
 
