@@ -236,6 +236,15 @@ def test_plots_without_matplotlib_name_the_extra(kitti_folder, detected, tmp_pat
     assert "pip install 'jaxbox[plots]'" in result.stderr
 
 
+def test_eval_without_matplotlib_prints_its_tables_and_says_why_there_are_no_plots(
+    kitti_folder, detected, monkeypatch
+):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    result = run("eval", "--labels", kitti_folder, "--results", detected[0])
+    assert result.exit_code == 0
+    assert "no plots: plots need matplotlib: pip install 'jaxbox[plots]'" in result.stdout.replace("\n", " ")
+
+
 @pytest.mark.parametrize("command", ["demo", "detect", "eval", "info"])
 def test_every_help_states_the_exit_codes(command):
     result = run(command, "--help")

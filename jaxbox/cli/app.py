@@ -114,7 +114,8 @@ def evaluate(
     results: Annotated[pathlib.Path, typer.Option(help="The folder that `detect` wrote to.")],
     json: Annotated[pathlib.Path | None, typer.Option(help="Also write every figure to this file.")] = None,
     plots: Annotated[
-        pathlib.Path | None, typer.Option(help="Folder for the plots; needs the plots extra.")
+        pathlib.Path | None,
+        typer.Option(help="Folder for the plots (the plots extra); RESULTS/plots unless given."),
     ] = None,
     missing_as_empty: Annotated[
         bool, typer.Option("--missing-as-empty", help="Take a missing result file for one without boxes.")

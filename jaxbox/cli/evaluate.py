@@ -20,6 +20,8 @@ SELECTION_NAMES = {
     "easy_to_moderate": "KITTI's easy and moderate",
     "clear": "at least 30 points, occlusion 0 or 1",
 }
+PLOTS_FOLDER = "plots"
+"""Where in the results' folder the plots go, unless said otherwise."""
 SIZE_SELECTION = "easy_to_hard"
 """The cars whose median the constant row answers."""
 CUT_OVERLAP = 0.5
@@ -43,12 +45,12 @@ def run_eval(
       results: folder of KITTI result files.
       missing_as_empty: take a missing result file for an empty one.
       json_path: file for every figure, or None.
-      plots: folder for the plots, or None.
+      plots: folder for the plots; None for ``plots`` in the results' folder, if matplotlib is there.
       console: where the tables go.
 
     Raises:
       InputError: where labels or results cannot be used.
-      ImportError: for plots without matplotlib.
+      ImportError: without matplotlib, where a folder for the plots is given.
     """
     report = evaluate_folders(labels, results, missing_as_empty=missing_as_empty)
     print_report(report, console)
@@ -56,10 +58,16 @@ def run_eval(
         with atomic_writer(json_path) as handle:
             json.dump(report, handle, indent=1, allow_nan=False)
         console.print(f"wrote {json_path}", markup=False)
-    if plots is not None:
-        objects = report["selections"][SIZE_SELECTION]["objects"]
-        for path in write_plots(objects, plots):
-            console.print(f"wrote {path}", markup=False)
+    objects = report["selections"][SIZE_SELECTION]["objects"]
+    try:
+        paths = write_plots(objects, plots or results / PLOTS_FOLDER)
+    except ImportError as error:
+        if plots is not None:
+            raise
+        console.print(f"no plots: {error}", markup=False)
+        return
+    for path in paths:
+        console.print(f"wrote {path}", markup=False)
 
 
 def print_report(report: Mapping[str, Any], console: Console) -> None:
