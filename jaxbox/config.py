@@ -13,6 +13,8 @@ from typing import Any, Literal, TypeVar, dataclass_transform
 import jax
 import numpy as np
 
+from jaxbox.capacities import CAPACITY_STEP, rough_counts
+
 _T = TypeVar("_T")
 
 Scalar = float | jax.Array
@@ -463,7 +465,7 @@ class DetectorConfig:
         base = cls() if base is None else base
         if not margin >= 1:
             raise ValueError(f"margin is {margin}; it must be at least 1.")
-        counts = [_rough_counts(base, index, xyz) for index, xyz in enumerate(sweeps)]
+        counts = [rough_counts(base, index, xyz) for index, xyz in enumerate(sweeps)]
         if not counts:
             raise ValueError("there are no sweeps; pass at least one (n, 3) array.")
         largest = np.maximum(margin * np.max(counts, axis=0), 1)
@@ -475,52 +477,3 @@ class DetectorConfig:
             clustering=dataclasses.replace(base.clustering, maps=maps, max_obstacles=obstacles),
             box=dataclasses.replace(base.box, max_slab_points=slab),
         )
-
-
-CAPACITY_STEP = 1024
-"""Proposed capacities are multiples of this."""
-
-
-def _rough_counts(config: DetectorConfig, index: int, xyz: np.ndarray) -> list[int]:
-    """Points above the ground, points that boxes are fitted to, and occupied cells of each map."""
-    xyz = np.asarray(xyz)
-    if xyz.ndim != 2 or xyz.shape[1] != 3:
-        raise ValueError(f"sweep {index} has shape {xyz.shape}; it must be (n, 3). Pass points[:, :3].")
-    region = np.array([config.region.half_x_m, config.region.half_y_m])
-    within = np.isfinite(xyz).all(axis=1) & (np.abs(xyz[:, :2]) < region).all(axis=1)
-    xyz = xyz[within].astype(np.float64)
-    xy, height = xyz[:, :2], _rough_height(xyz)
-
-    def between(settings: GroundConfig | ComponentMap) -> np.ndarray:
-        return (height > settings.min_height_m) & (height < settings.max_height_m)
-
-    slab = (height > config.box.slab_min_height_m) & (height < config.box.slab_max_height_m)
-    drawn = _rough_warp(xy, config.clustering)
-    counts = [np.sum(between(config.ground)), np.sum(slab & between(config.ground))]
-    for m in config.clustering.maps:
-        level = np.minimum((height - m.min_height_m) // m.cell_m, m.num_levels - 1)
-        cells = np.column_stack([drawn // m.cell_m, level])[between(m)]
-        counts.append(len(np.unique(cells, axis=0)))
-    return [int(count) for count in counts]
-
-
-def _rough_height(xyz: np.ndarray) -> np.ndarray:
-    """(n,) m: height over the lowest point of the 1 m cell and the eight round it."""
-    if len(xyz) == 0:
-        return np.zeros(0)
-    cell = np.floor(xyz[:, :2]).astype(int)
-    cell -= cell.min(axis=0)
-    lowest = np.full(cell.max(axis=0) + 3, np.inf)
-    for i, j in np.ndindex(3, 3):
-        np.minimum.at(lowest, (cell[:, 0] + i, cell[:, 1] + j), xyz[:, 2])
-    return xyz[:, 2] - lowest[cell[:, 0] + 1, cell[:, 1] + 1]
-
-
-def _rough_warp(xy: np.ndarray, settings: ClusteringConfig) -> np.ndarray:
-    """Far points drawn together as the maps draw them, so that beyond the start cells hold more."""
-    rho = np.linalg.norm(xy, axis=1)
-    beyond, growth = (
-        np.maximum(rho - settings.adaptive_start_m, 0),
-        max(float(settings.adaptive_growth), 1e-9),
-    )
-    return xy * (1 + (np.log1p(growth * beyond) / growth - beyond) / np.maximum(rho, 1e-9))[:, None]
