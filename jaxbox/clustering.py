@@ -6,7 +6,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import WORD_BITS, prefix_sum, take
+from jaxbox.masked import WORD_BITS, lookup, prefix_sum, take
 from jaxbox.types import Clusters
 
 
@@ -92,8 +92,11 @@ def label_components(
     occupied = _CellSet(index, member, shape)
     node = occupied.rank(index, member)
     node = jnp.where(node < max_cells, node, max_cells)
-    # All points of a cell write the same value, so their order does not matter.
-    cells = jnp.full((max_cells, 3), -2, jnp.int32).at[node].set(index, mode="drop")
+    # All points of a cell write the same value, so their order does not matter. Rows beyond the occupied
+    # cells read as cell 0, a corner of the grid: its neighbours are one another's, so it links nothing new.
+    flat = jnp.zeros(max_cells, jnp.int32).at[node].set(occupied.flat(index), mode="drop")
+    x_y, level = flat // shape[2], flat % shape[2]
+    cells = jnp.stack([x_y // shape[1], x_y % shape[1], level], axis=1)
     parent = _hook_and_jump(_neighbours(cells, occupied, max_cells))
     return take(parent, node, max_cells), occupied.count
 
@@ -102,15 +105,17 @@ class _CellSet:
     """A set of grid cells as bits, with the number of members before each one.
 
     Cell c is bit c // W of word c % W, with W words: packing is then 32 shifts of contiguous rows, and a
-    member's rank is two small gathers instead of a table as large as the grid.
+    member's rank is two small gathers instead of a table as large as the grid. W is a power of two, so that
+    neither takes a division.
     """
 
     def __init__(self, index: jax.Array, member: jax.Array, shape: tuple[int, int, int]):
         self.shape = shape
         size = shape[0] * shape[1] * shape[2]
-        self.num_words = -(-size // WORD_BITS)
+        self.word_bits = max((-(-size // WORD_BITS) - 1).bit_length(), 0)
+        self.num_words = 2**self.word_bits
         slots = self.num_words * WORD_BITS
-        flat = jnp.where(member, self._flat(index), slots)
+        flat = jnp.where(member, self.flat(index), slots)
         flags = jnp.zeros(slots, jnp.uint8).at[flat].set(1, mode="drop")
         rows = flags.reshape(WORD_BITS, self.num_words).astype(jnp.uint32)
         self.words = jnp.sum(
@@ -121,16 +126,17 @@ class _CellSet:
         self.before = total - population
         self.count = total[-1]
 
-    def _flat(self, index: jax.Array) -> jax.Array:
+    def flat(self, index: jax.Array) -> jax.Array:
+        """Cells in row-major order."""
         return (index[..., 0] * self.shape[1] + index[..., 1]) * self.shape[2] + index[..., 2]
 
     def rank(self, index: jax.Array, asked: jax.Array) -> jax.Array:
         """Members before each asked cell, or a number beyond all where the cell is no member."""
-        flat = self._flat(index)
-        word, bit = flat % self.num_words, (flat // self.num_words).astype(jnp.uint32)
-        bits = self.words[word]
+        flat = self.flat(index)
+        word, bit = flat & (self.num_words - 1), (flat >> self.word_bits).astype(jnp.uint32)
+        bits = lookup(self.words, word)
         lower = bits & ((jnp.uint32(1) << bit) - 1)
-        rank = self.before[word] + jax.lax.population_count(lower).astype(jnp.int32)
+        rank = lookup(self.before, word) + jax.lax.population_count(lower).astype(jnp.int32)
         present = asked & ((bits >> bit) & 1 == 1)
         return jnp.where(present, rank, jnp.iinfo(jnp.int32).max)
 
@@ -152,8 +158,8 @@ def _hook_and_jump(neighbours: jax.Array) -> jax.Array:
 
     def step(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         parent, _ = state
-        grandparent = parent[parent]
-        lowest = jnp.minimum(grandparent, jnp.min(grandparent[neighbours], axis=0))
+        grandparent = lookup(parent, parent)
+        lowest = jnp.minimum(grandparent, jnp.min(lookup(grandparent, neighbours), axis=0))
         hooked = parent.at[parent].min(lowest)
         new = jnp.minimum(hooked, lowest)
         return new, jnp.any(new != parent)
