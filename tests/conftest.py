@@ -4,6 +4,7 @@ import os
 import pathlib
 
 import jax
+import parity
 import pytest
 
 DATA = pathlib.Path(os.environ.get("JAXBOX_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
@@ -24,3 +25,11 @@ def data_root() -> pathlib.Path:
     if not DATA.is_dir():
         pytest.skip(f"no real sweeps: {DATA} is not a folder; set JAXBOX_DATA")
     return DATA
+
+
+@pytest.fixture(params=["synthetic", "real"])
+def cases(request: pytest.FixtureRequest) -> tuple[parity.Case, ...]:
+    """The sweeps of `parity`, with the reference's results: twenty seeds, then five real ones."""
+    if request.param == "synthetic":
+        return parity.synthetic_cases()
+    return parity.real_cases(request.getfixturevalue("data_root"))

@@ -1,0 +1,240 @@
+"""Parity with the reference and OpenCV: hulls, rectangles, the scene's direction, descriptors."""
+
+import functools
+import math
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+import parity
+import pytest
+
+from jaxbox import box, descriptors, hull, reference
+from jaxbox.masked import map_rows
+
+SETTINGS = parity.CONFIG.box
+CRITERIA = ("area", "variance", "closeness", "visible_closeness")
+NUM_SLICES = parity.CONFIG.hull.num_slices
+MAX_VERTICES = 128
+MAX_FITS = 4096
+"""Rows for the clusters of all cases of a kind."""
+
+extreme_points = jax.jit(
+    functools.partial(hull.extreme_points, num_clusters=parity.MAX_CLUSTERS, num_slices=NUM_SLICES)
+)
+trace_hulls = jax.vmap(functools.partial(hull.convex_hull, max_vertices=MAX_VERTICES))
+
+
+@jax.jit
+def convex_hulls(points, valid, num_clusters):
+    # In chunks, or the work would be that of all rows.
+    return map_rows(lambda rows: trace_hulls(*rows), (points, valid), num_rows=num_clusters, chunk=16)
+
+
+polygon_area = jax.jit(hull.polygon_area)
+try_rotations = jax.jit(box.try_rotations, static_argnames=("criterion", "num_angles"))
+scene_preference = jax.jit(box.scene_preference, static_argnames="num_angles")
+shape_descriptors = jax.jit(descriptors.shape_descriptors)
+
+
+def random_clouds(count, size):
+    """(count, size, 2) m: discs, lines, rings and L shapes, near and far."""
+    rng = np.random.default_rng(0)
+    clouds = []
+    for number in range(count):
+        u, v = rng.uniform(-1, 1, (2, size))
+        shape = number % 4
+        if shape == 1:
+            v = 1e-3 * v
+        elif shape == 2:
+            u, v = np.cos(np.pi * u), np.sin(np.pi * u)
+        elif shape == 3:
+            u, v = np.where(v > 0, u, -1), np.where(v > 0, -1, u)
+        turn = rng.uniform(0, np.pi)
+        xy = np.column_stack(
+            [2 * u * np.cos(turn) - v * np.sin(turn), 2 * u * np.sin(turn) + v * np.cos(turn)]
+        )
+        clouds.append(xy + rng.uniform(-60, 60, 2))
+    return np.array(clouds, np.float32)
+
+
+def opencv_hull(xy):
+    """(h, 2) float32 vertices of a set without repeated points."""
+    return cv2.convexHull(np.unique(xy, axis=0)).reshape(-1, 2)
+
+
+def distance_to_outline(points, polygon):
+    """(n,) m, from points to the nearest edge of a closed polygon."""
+    start, edge = polygon, np.roll(polygon, -1, axis=0) - polygon
+    along = np.einsum("nhd,hd->nh", points[:, None] - start, edge) / np.maximum((edge**2).sum(axis=1), 1e-18)
+    nearest = start + np.clip(along, 0, 1)[..., None] * edge
+    return np.linalg.norm(points[:, None] - nearest, axis=2).min(axis=1)
+
+
+def assert_same_hull(vertices, expected, what):
+    """The same vertices, but for those less than 0.1 mm off the line between their neighbours."""
+    vertices, expected = vertices.astype(float), expected.astype(float)
+    scale = np.prod(np.ptp(expected, axis=0))
+    area, expected_area = reference.signed_area(vertices), abs(reference.signed_area(expected))
+    parity.assert_within((area - expected_area) / max(expected_area, 1e-3 * scale), 1e-5, f"area {what}")
+    ours, theirs = set(map(tuple, vertices)), set(map(tuple, expected))
+    for extra, polygon in ((ours - theirs, expected), (theirs - ours, vertices)):
+        if extra:
+            parity.assert_within(distance_to_outline(np.array(list(extra)), polygon), 1e-4, f"vertex {what}")
+
+
+@pytest.mark.parametrize("size", [3, 10, 128])
+def test_hulls_of_random_points_are_those_of_opencv(size):
+    clouds = random_clouds(400, size)
+    vertices, count = convex_hulls(clouds, np.ones(clouds.shape[:2], bool), len(clouds))
+    areas = polygon_area(vertices)
+    for xy, ours, num, area in zip(clouds, np.asarray(vertices), np.asarray(count), areas, strict=True):
+        assert 3 <= num <= MAX_VERTICES
+        assert_same_hull(ours[:num], opencv_hull(xy), "random")
+        assert float(area) == pytest.approx(
+            reference.signed_area(ours[:num].astype(float)), rel=1e-4, abs=1e-6
+        )
+
+
+def test_hulls_of_clusters_are_those_of_opencv(cases):
+    for case in cases:
+        points, count = parity.padded_points([case])
+        valid = np.arange(points.shape[1]) < count[:, None]
+        rows = (parity.pad(values, parity.MAX_CLUSTERS) for values in (points, valid))
+        vertices, num = map(np.asarray, convex_hulls(*rows, len(count)))
+        for k, proposal in enumerate(case.proposals):
+            if count[k] >= 3:
+                ours = vertices[k, : num[k]]
+                assert_same_hull(ours, opencv_hull(points[k, : count[k]]), "cluster")
+                # The reference's own hull, of all the same points.
+                expected = reference.convex_hull(proposal.xy)
+                assert abs(reference.signed_area(ours.astype(float)) - reference.signed_area(expected)) < 1e-3
+
+
+def test_extreme_points_lose_at_most_a_slice_of_the_hull(cases):
+    for case in cases:
+        xy = case.obstacles.xyz[:, :2].astype(np.float32)
+        slot = np.where(case.slot < 0, parity.MAX_CLUSTERS, case.slot)
+        rows = (
+            parity.pad(slot, parity.MAX_OBSTACLES, parity.MAX_CLUSTERS),
+            parity.pad(xy, parity.MAX_OBSTACLES),
+        )
+        index = np.asarray(extreme_points(*rows))
+        for k in range(len(case.proposals)):
+            kept = index[k][index[k] < len(xy)]
+            assert np.all(case.slot[kept] == k)
+            members = xy[case.slot == k].astype(float)
+            polygon = opencv_hull(xy[kept])
+            outside = np.array([cv2.pointPolygonTest(polygon, p, False) < 0 for p in members.tolist()])
+            far = distance_to_outline(members, polygon.astype(float))[outside]
+            extent = np.ptp(members, axis=0).max()
+            bound = extent / NUM_SLICES + extent / 2**11
+            parity.assert_within(np.append(far, 0) / bound, 1, "of the bound of a slice")
+
+
+def fits_of(cases):
+    points, count = parity.padded_points(cases)
+    return points, count, (parity.pad(points, MAX_FITS), parity.pad(count, MAX_FITS), np.int32(len(count)))
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, criterion):
+    options = {"num_angles": SETTINGS.num_angles, "min_distance_m": SETTINGS.min_distance_m}
+    points, count, fits = fits_of(cases)
+    curves, extents = try_rotations(*fits, criterion=criterion, **options)
+    rectangles = jax.tree.map(
+        np.asarray, box.best_rectangles(curves, extents, jnp.zeros(SETTINGS.num_angles))
+    )
+    curves, extents = np.asarray(curves), np.stack(extents, axis=-1)
+    angles = np.round(rectangles.angle / (math.pi / 2 / SETTINGS.num_angles)).astype(int)
+    wrong = worse = 0
+    for k in range(len(count)):
+        xy = points[k, : count[k]].astype(float)
+        expected, bounds = reference.criterion_curve(xy, criterion=criterion, **options)
+        parity.assert_within(extents[k] - bounds, 3e-5, "m of extents")
+        scale = 1 if "closeness" in criterion else max(np.ptp(expected), 0.1)
+        wrong += np.sum(np.abs(curves[k] - expected) > 1e-3 * scale)
+        worse += expected[angles[k]] < expected.max() - 1e-3 * scale
+        best = np.stack([rectangles.low[k], rectangles.high[k]], axis=1).reshape(4)
+        parity.assert_within(best - bounds[angles[k]], 3e-5, "m of the best extents")
+    # Which of two equally near edges faces the sensor, or is nearest to a point, may round either way.
+    parity.assert_share(wrong, len(count) * SETTINGS.num_angles, 1e-3, f"curve {criterion}")
+    parity.assert_share(worse, len(count), 2e-3, f"best {criterion}")
+
+
+def test_smallest_area_is_that_of_opencv_within_the_bound_of_the_step(cases):
+    points, count, fits = fits_of(cases)
+    curve, _ = try_rotations(*fits, criterion="area", num_angles=SETTINGS.num_angles, min_distance_m=0.05)
+    step = math.pi / 2 / SETTINGS.num_angles
+    for k in range(len(count)):
+        _, (length, width), _ = reference.min_area_rectangle(points[k, : count[k]])
+        area = -float(np.max(curve[k]))
+        # Turned by half a step off the best, l w grows to at most l w + (l^2 + w^2) / 2 sin(step).
+        bound = (length**2 + width**2) / 2 * math.sin(step)
+        assert length * width - 1e-3 <= area <= length * width + bound + 1e-3
+
+
+def test_scene_direction_is_that_of_the_reference():
+    rng = np.random.default_rng(0)
+    options = {"num_angles": 90, "sigma_deg": SETTINGS.direction_sigma_deg}
+    for _ in range(50):
+        count = rng.integers(0, 12)
+        yaw, extent = rng.uniform(-4, 4, count), rng.uniform(0, 9, count)
+        num_points, free = rng.integers(5, 400, count), rng.uniform(0, 0.3, count)
+        limits = {"min_extent_m": SETTINGS.direction_min_extent_m, "max_free": SETTINGS.direction_max_free}
+        voting = (extent >= limits["min_extent_m"]) & (free <= limits["max_free"])
+        expected = reference.direction_preference(
+            reference.scene_direction(yaw, extent, num_points, free, **options, **limits),
+            weight=SETTINGS.direction_weight,
+            **options,
+        )
+        rows = (parity.pad(value, 16) for value in (yaw, extent, num_points, voting))
+        preference = scene_preference(*rows, weight=SETTINGS.direction_weight, **options)
+        parity.assert_within(preference - expected, 1e-4, "preference")
+
+
+def test_scene_direction_of_sweeps_is_that_of_the_reference(cases):
+    for case in cases:
+        fits = [(p, done) for p, done in case.boxes if done is not None]
+        yaw = np.array([done.box[4] for _, done in fits])
+        extent = np.array([max(done.measured_length_m, done.measured_width_m) for _, done in fits])
+        num_points = np.array([len(p.members) for p, _ in fits])
+        options = {"num_angles": SETTINGS.num_angles, "sigma_deg": SETTINGS.direction_sigma_deg}
+        least = SETTINGS.direction_min_extent_m
+        direction = reference.scene_direction(
+            yaw, extent, num_points, np.zeros(len(yaw)), min_extent_m=least, max_free=1.0, **options
+        )
+        rows = (
+            parity.pad(value, parity.MAX_CLUSTERS) for value in (yaw, extent, num_points, extent >= least)
+        )
+        preference = scene_preference(*rows, weight=0.2, **options)
+        assert direction == np.argmax(preference)
+
+
+def test_descriptors_are_those_of_the_reference(cases):
+    for case in cases:
+        xy = case.obstacles.xyz[:, :2].astype(np.float32)
+        slot = np.where(case.slot < 0, parity.MAX_CLUSTERS, case.slot)
+        members = [xy[case.slot == k].astype(float) for k in range(len(case.proposals))]
+        hulls = [reference.convex_hull(m) for m in members]
+        expected = [reference.shape_descriptors(m, h) for m, h in zip(members, hulls, strict=True)]
+        ours = shape_descriptors(
+            parity.pad(slot, parity.MAX_OBSTACLES, parity.MAX_CLUSTERS),
+            parity.pad(xy, parity.MAX_OBSTACLES),
+            # Up to a metre beside the middle, as that of a completed box may be.
+            parity.pad(np.array([m.mean(axis=0) + 0.7 for m in members]), parity.MAX_CLUSTERS),
+            parity.pad(np.array([abs(reference.signed_area(h)) for h in hulls]), parity.MAX_CLUSTERS),
+            parity.pad(np.array([len(h) for h in hulls]), parity.MAX_CLUSTERS),
+        )
+        ours, count = parity.on_host(ours), len(members)
+        moments = np.array([e.moment_of_inertia for e in expected])
+        parity.assert_within(ours.moment_of_inertia[:count] - moments, 1e-4, "m^2 of moments")
+        for name in ("density", "complexity"):
+            values = np.array([getattr(e, name) for e in expected])
+            np.testing.assert_allclose(getattr(ours, name)[:count], values, rtol=1e-5)
+        values = np.array([e.eccentricity for e in expected])
+        wide = moments[:, 1] > 1e-3
+        np.testing.assert_allclose(ours.eccentricity[:count][wide], values[wide], rtol=1e-2)
+        assert wide.sum() > 10
+        assert np.all(ours.eccentricity[count:] == 1)

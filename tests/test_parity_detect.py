@@ -1,0 +1,68 @@
+"""Parity with the reference end to end: the same boxes from the same sweep, for both presets."""
+
+import importlib
+
+import numpy as np
+import parity
+import pytest
+
+import jaxbox
+from jaxbox import DetectorConfig, reference
+
+MIN_SCORE = 0.05
+PRESETS = DetectorConfig.presets()
+SWEEPS = slice(1, 3)
+"""Two of each kind, as the reference takes seconds for each."""
+
+# The package exports the function under the module's name.
+reference_detector = importlib.import_module("jaxbox.reference.detector")
+
+
+def boxes_of(detections):
+    """(k, 8) centre, size, yaw and score."""
+    rows = np.column_stack([detections.center, detections.size, detections.yaw, detections.score])
+    return rows[np.asarray(getattr(detections, "valid", np.ones(len(rows), bool)))]
+
+
+def num_partners(boxes, others):
+    """Boxes that count, and those of them with one of the others in 10 cm, 10 cm of size and 2 degrees."""
+    boxes = boxes[boxes[:, 7] > MIN_SCORE]
+    gap = np.abs(boxes[:, None] - others)
+    turn = (boxes[:, None, 6] - others[:, 6] + np.pi / 2) % np.pi - np.pi / 2
+    near = np.linalg.norm(gap[..., :3], axis=2) < 0.1
+    alike = near & (gap[..., 3:6] < 0.1).all(axis=2) & (np.abs(turn) < np.radians(2))
+    return np.array([len(boxes), alike.any(axis=1).sum()])
+
+
+def detect(case, preset):
+    cloud = jaxbox.PointCloud.from_numpy(case.xyz, capacity=parity.CAPACITY)
+    return parity.on_host(jaxbox.detect(cloud, PRESETS[preset]))
+
+
+def missing(cases, preset, use_plane):
+    """Boxes that count and have no partner, and boxes that count; of jaxbox and the reference together."""
+    total = np.zeros(2, int)
+    for case in cases[SWEEPS]:
+        detections = detect(case, preset)
+        use_plane(detections.ground)
+        ours, theirs = boxes_of(detections), boxes_of(reference.detect(case.xyz, PRESETS[preset]))
+        total += num_partners(ours, theirs) + num_partners(theirs, ours)
+    return total[0] - total[1], total[0]
+
+
+@pytest.mark.parametrize("preset", list(PRESETS))
+def test_on_one_ground_plane_both_find_the_same_boxes(cases, preset, monkeypatch):
+    def use_plane(plane):
+        fit = plane.coefficients.astype(float), bool(plane.found), int(plane.num_inliers)
+        monkeypatch.setattr(reference_detector, "fit_ground_planes", lambda *_, **__: [fit])
+
+    bad, total = missing(cases, preset, use_plane)
+    assert total > 15
+    parity.assert_share(bad, total, 0.02, f"boxes of {preset}, on one plane")
+
+
+@pytest.mark.parametrize(("preset", "limit"), [("default", 0.15), ("paper", 0.4)])
+def test_on_planes_of_their_own_most_boxes_are_the_same(cases, preset, limit):
+    # The paper's candidates hold walls too, so that its plane, and with it every height, is less sure.
+    bad, total = missing(cases, preset, use_plane=lambda plane: None)
+    parity.assert_share(bad, total, limit, f"boxes of {preset}, each on its own plane")

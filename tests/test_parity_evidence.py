@@ -1,0 +1,179 @@
+"""Parity with the reference: the polar evidence, rays over boxes, completion, all on equal inputs."""
+
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import parity
+import pytest
+
+from jaxbox import completion, evidence, reference
+from jaxbox.types import NOT_A_BOX, Boxes, Rectangles
+
+EVIDENCE = parity.all_options(parity.CONFIG.evidence, "enabled")
+RANGE_CELL_M = parity.CONFIG.evidence.range_cell_m
+COMPLETION = parity.all_options(parity.CONFIG.completion, "mode", "num_rays", "num_final_rays")
+NUM_RAYS = parity.CONFIG.completion.num_rays
+SIZES = ("length_m", "width_m")
+LIMITS = ("max_length_m", "max_width_m")
+
+build_evidence = jax.jit(
+    evidence.build_evidence, static_argnames=("num_azimuths", "num_ranges", "range_cell_m")
+)
+ground_support = jax.jit(evidence.ground_support)
+
+
+@jax.jit
+def cast_rays(seen, boxes):
+    center, (length, width, yaw) = boxes[:, :2], boxes[:, 2:].T
+    options = {"num_rays": NUM_RAYS, "range_cell_m": RANGE_CELL_M}
+    return evidence.cast_rays(seen, center, length, width, yaw, **options)
+
+
+@jax.jit
+def complete(rectangles, points, count, seen, prior):
+    """As the wiring does: hypotheses, their rays and their points, and the choice."""
+    boxes = completion.box_hypotheses(rectangles, **prior)
+    rays = evidence.cast_rays(
+        seen, boxes.center, boxes.length, boxes.width, boxes.yaw, num_rays=NUM_RAYS, range_cell_m=RANGE_CELL_M
+    )
+    inside, near = completion.point_agreement(boxes, points, count)
+    return completion.choose_hypothesis(
+        boxes,
+        rectangles.worth,
+        hit=rays.hit,
+        free=rays.free,
+        free_length=rays.free_length,
+        inside=inside,
+        near=near,
+        **COMPLETION,
+    )
+
+
+def random_boxes(count, rng):
+    """(count, 5): near and far, of all turns and sizes up to a truck's; some round the sensor."""
+    columns = rng.uniform([-60, -50, 0.5, 0.3, -4], [60, 50, 12, 3, 4], (count, 5))
+    columns[: count // 8, :2] /= 20
+    return columns.astype(np.float32)
+
+
+def test_evidence_differs_in_few_cells_only(cases):
+    wrong = np.zeros(4, int)
+    for case in cases:
+        ours = build_evidence(
+            parity.pad(case.xyz, parity.CAPACITY),
+            parity.pad(case.height, parity.CAPACITY),
+            parity.pad(case.inlier, parity.CAPACITY),
+            -case.plane[2],
+            **EVIDENCE,
+        )
+        hit, free = (np.diff(np.asarray(sums, int), axis=0).T for sums in (ours.hit, ours.free))
+        hits, frees = (np.diff(sums, axis=1) for sums in (case.evidence.hit_sums, case.evidence.free_sums))
+        parity.assert_share(np.sum(ours.support != case.evidence.support), 200**2, 2e-3, "support")
+        wrong += np.abs(hit - hits).sum() // 2, hits.sum(), np.sum(free != frees), frees.sum()
+    # A return whose azimuth or range lies on the edge of a cell may round into the next.
+    parity.assert_share(*wrong[:2], 1e-4, "hits")
+    parity.assert_share(*wrong[2:], 1e-4, "free cells")
+
+
+def test_ground_support_is_looked_up_where_the_reference_does(cases):
+    rng = np.random.default_rng(0)
+    for case in cases:
+        xy = rng.uniform(-120, 120, (64, 2)).astype(np.float32)
+        expected = [reference.support_at(place, case.evidence) for place in xy.astype(float)]
+        np.testing.assert_array_equal(ground_support(case.evidence_as_input(), xy), expected)
+
+
+def test_rays_over_boxes_end_as_in_the_reference(cases):
+    rng = np.random.default_rng(0)
+    for case in cases:
+        found = [done.box for _, done in case.boxes if done is not None]
+        boxes = np.concatenate([random_boxes(512, rng), np.array(found, np.float32)])
+        expected = reference.box_evidence(boxes.astype(float), case.evidence, num_rays=NUM_RAYS)
+        rays = parity.on_host(cast_rays(case.evidence_as_input(), parity.pad(boxes, 1024)))
+        differ = np.zeros(len(boxes), bool)
+        for kind in ("hit", "free", "deep", "occluded", "free_length"):
+            gap = np.abs(getattr(rays, kind)[: len(boxes)] - getattr(expected, kind))
+            differ |= gap > 1e-6
+            parity.assert_share(
+                np.sum(gap > 2.5 / NUM_RAYS), len(boxes), 0.005, f"rays {kind}, more than two"
+            )
+        # A ray on the edge of an azimuth cell, or a range on that of a range cell, may round either way.
+        parity.assert_share(differ.sum(), len(boxes), 0.005, "boxes with a ray that ends otherwise")
+        assert (expected.hit > 0.25).sum() > 10
+        assert (expected.free > 0.25).sum() > 10
+
+
+def rectangles_of(proposals, angles):
+    extents = np.array([p.extents[a] for p, a in zip(proposals, angles, strict=True)])
+    worth = np.array([p.curve[a] for p, a in zip(proposals, angles, strict=True)])
+    low, high = extents[:, [0, 2]], extents[:, [1, 3]]
+    rows = np.array(angles) * math.pi / 2 / 90, low, high, worth
+    return Rectangles(*(parity.pad(values, parity.MAX_CLUSTERS) for values in rows))
+
+
+def prior_of(vehicle, *names):
+    return {name: jnp.full(parity.MAX_CLUSTERS, getattr(vehicle, name)) for name in names}
+
+
+def rows_of(boxes: Boxes, expected):
+    """Boxes, measured sizes and J of the stage and of the reference, which agree on what is a box."""
+    is_box = np.array([e is not None for e in expected])
+    np.testing.assert_array_equal(boxes.objective[: len(expected)] > NOT_A_BOX, is_box)
+    parts = boxes.center, boxes.length, boxes.width, boxes.yaw, boxes.measured, boxes.objective
+    done = [e for e in expected if e is not None]
+    theirs = [[*e.box, e.measured_length_m, e.measured_width_m, e.objective] for e in done]
+    assert len(done) > 10
+    return np.column_stack(parts)[: len(expected)][is_box], np.array(theirs)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_completed_boxes_are_those_of_the_reference(cases, number):
+    vehicle = parity.CONFIG.vehicles.classes[number]
+    rng = np.random.default_rng(number)
+    pairs = []
+    for case in cases:
+        # The best rotation for cars; any for vans, so that bad rectangles are completed alike too.
+        angles = [int(np.argmax(p.curve)) if number == 0 else rng.integers(90) for p in case.proposals]
+        expected = [
+            parity.complete(p, a, vehicle, case.evidence) for p, a in zip(case.proposals, angles, strict=True)
+        ]
+        points, count = parity.padded_points([case])
+        boxes = complete(
+            rectangles_of(case.proposals, angles),
+            parity.pad(points, parity.MAX_CLUSTERS),
+            parity.pad(count, parity.MAX_CLUSTERS),
+            case.evidence_as_input(),
+            prior_of(vehicle, *SIZES, *LIMITS),
+        )
+        pairs.append(rows_of(parity.on_host(boxes), expected))
+    ours, theirs = (np.concatenate(rows) for rows in zip(*pairs, strict=True))
+    gap = np.abs(ours[:, -1] - theirs[:, -1])
+    # A ray that ends otherwise moves J by a step of 1 / 32, and by the length that it had free.
+    parity.assert_share(np.sum(gap > 1e-4), len(gap), 0.005, f"J of boxes completed {number}")
+    parity.assert_within(gap, 0.3, f"J of boxes completed {number}")
+    # Rays come in thirty-seconds, so that two hypotheses may be worth the same: either may be chosen.
+    other = np.max(np.abs(ours - theirs)[:, :-1], axis=1) > 1e-4
+    parity.assert_share(np.sum(other & (gap > 1e-5)), len(other), 0.005, f"boxes completed {number}")
+    parity.assert_share(other.sum(), len(other), 0.04, f"boxes completed {number}, ties among them")
+
+
+@pytest.mark.parametrize("mode", ["away", "none"])
+def test_boxes_without_evidence_are_those_of_the_reference(cases, mode):
+    vehicle = parity.CONFIG.vehicles.classes[0]
+    if mode == "none":
+        stage, prior = completion.keep_measured, prior_of(vehicle, *LIMITS)
+    else:
+        stage, prior = completion.extend_away, prior_of(vehicle, *SIZES, *LIMITS)
+    stage = jax.jit(functools.partial(stage, **prior))
+    for case in cases:
+        angles = [int(np.argmax(p.curve)) for p in case.proposals]
+        expected = [
+            parity.complete(p, a, vehicle, None, mode) for p, a in zip(case.proposals, angles, strict=True)
+        ]
+        boxes = parity.on_host(stage(rectangles_of(case.proposals, angles)))
+        ours, theirs = rows_of(boxes, expected)
+        parity.assert_within((ours - theirs)[:, :-1], 1e-4, f"boxes {mode}")
+        assert np.all(ours[:, -1] == completion.CERTAIN)

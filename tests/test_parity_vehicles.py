@@ -1,0 +1,181 @@
+"""Parity with the reference: points round boxes, scores, overlap and suppression, on equal inputs."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import parity
+
+from jaxbox import geometry, reference, vehicles
+
+SETTINGS = parity.CONFIG.vehicles
+AROUND = parity.select_options(SETTINGS, "margin_m", "ring_m")
+SCORE = parity.select_options(
+    SETTINGS,
+    *("top_grade", "min_extent_m", "saturation_points", "sparseness_power", "free_scale", "ring_weight"),
+    *("overhead_weight", "support_points", "objective_gate", "objective_softness"),
+)
+EVIDENCE_SCORE = {
+    name: SCORE[name]
+    for name in SCORE
+    if name
+    in (
+        "saturation_points",
+        "sparseness_power",
+        "free_scale",
+        "support_points",
+        "objective_gate",
+        "objective_softness",
+    )
+}
+HEIGHTS = ("height_m", "height_tolerance_m", "min_height_m", "max_height_m")
+MAX_BOXES = 1024
+NUM_RANDOM = 300
+
+count_points_around = jax.jit(
+    functools.partial(vehicles.count_points_around, **parity.REGION, **AROUND), static_argnames="max_nearby"
+)
+suppress = jax.jit(vehicles.suppress)
+rectangle_iou = jax.jit(jax.vmap(geometry.rectangle_iou))
+
+
+def boxes_of(case, rng):
+    """(n, 5) completed boxes of the case, and as many moved and turned at random."""
+    found = np.array([done.box for _, done in case.boxes if done is not None])
+    moved = found[rng.integers(len(found), size=NUM_RANDOM)]
+    moved = moved + rng.normal(0, [0.5, 0.5, 1, 0.3, 0.3], moved.shape)
+    moved[:, 2:4] = np.abs(moved[:, 2:4])
+    return np.concatenate([found, moved]).astype(np.float32)
+
+
+def test_points_round_boxes_are_those_of_the_reference(cases):
+    rng = np.random.default_rng(0)
+    limits = parity.select_options(parity.CONFIG.ground, "min_height_m", "max_height_m")
+    class_tops = [vehicle.count_max_height_m for vehicle in SETTINGS.classes]
+    for case in cases:
+        boxes = boxes_of(case, rng)
+        tops = rng.choice(class_tops, len(boxes)).astype(np.float32)
+        xy, height = case.obstacles.xyz[:, :2].astype(np.float32), case.obstacles.height.astype(np.float32)
+        around = count_points_around(
+            parity.pad(boxes, MAX_BOXES),
+            parity.pad(tops, MAX_BOXES),
+            len(boxes),
+            parity.pad(xy, parity.MAX_OBSTACLES),
+            parity.pad(height, parity.MAX_OBSTACLES),
+            parity.padded_mask(len(xy), parity.MAX_OBSTACLES),
+            max_nearby=2**15,
+        )
+        around = parity.on_host(around)
+        wrong, seen = 0, 0
+        for row, (box, top) in enumerate(zip(boxes.astype(float), tops.astype(float), strict=True)):
+            expected = reference.count_points_around(
+                box, case.obstacles.xyz, case.obstacles.height, **AROUND, **limits, count_max_height_m=top
+            )
+            theirs = np.array([expected.inside, expected.overhead, expected.ring])
+            ours = np.array([around.num_inside[row], around.num_above[row], around.num_ring[row]])
+            wrong, seen = wrong + np.abs(ours - theirs).sum(), seen + theirs.sum()
+            assert around.top[row] == np.float32(expected.top_m) or np.any(ours != theirs)
+        # A point on the edge of a box may round to either side of it.
+        parity.assert_share(wrong, seen, 1e-4, "points round boxes")
+
+
+@jax.jit
+def score_boxes(columns, prior):
+    around = vehicles.Surroundings(*columns["around"])
+    size = jnp.stack([columns["length"], columns["width"]], axis=1)
+    early = vehicles.evidence_score(
+        **{name: columns[name] for name in ("num_points", "hit", "free_length", "support", "objective")},
+        **EVIDENCE_SCORE,
+    )
+    sizes = vehicles.size_score(
+        size,
+        jnp.stack([prior["length_m"], prior["width_m"]], axis=1),
+        **{name: prior[name] for name in ("length_below_m", "length_above_m", "width_tolerance_m")},
+    )
+    late = vehicles.surroundings_score(
+        around,
+        columns["rho"],
+        **{name: prior[name] for name in HEIGHTS},
+        **{name: SCORE[name] for name in ("top_grade", "ring_weight", "overhead_weight")},
+    )
+    return early * sizes * late * prior["prior_weight"]
+
+
+def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
+    rng = np.random.default_rng(0)
+    label = rng.integers(0, 3, MAX_BOXES)
+    names = parity.all_options(SETTINGS.classes[0])
+    prior = {name: np.array([getattr(SETTINGS.classes[k], name) for k in label]) for name in names}
+    columns = {
+        "length": prior["length_m"] + rng.normal(0, 0.7, MAX_BOXES),
+        "width": prior["width_m"] + rng.normal(0, 0.2, MAX_BOXES),
+        "num_points": rng.integers(1, 300, MAX_BOXES),
+        "hit": rng.uniform(0, 1, MAX_BOXES),
+        "free_length": rng.uniform(0, 0.2, MAX_BOXES) ** 2,
+        "support": rng.integers(0, 30, MAX_BOXES),
+        "objective": rng.uniform(2, 3, MAX_BOXES),
+        "rho": rng.uniform(2, 80, MAX_BOXES),
+        "around": [
+            rng.integers(1, 400, MAX_BOXES),
+            prior["height_m"] + rng.normal(0, 0.5, MAX_BOXES),
+            rng.integers(0, 20, MAX_BOXES),
+            rng.integers(0, 20, MAX_BOXES),
+        ],
+    }
+    columns, prior = jax.tree.map(np.float32, (columns, prior))
+    scores = np.asarray(score_boxes(columns, prior))
+    expected = []
+    for row in range(MAX_BOXES):
+        inside, top, above, ring = (float(value[row]) for value in columns["around"])
+        one = {name: float(columns[name][row]) for name in ("objective", "hit", "free_length", "support")}
+        length, width = float(columns["length"][row]), float(columns["width"][row])
+        expected.append(
+            reference.score_box(
+                np.array([columns["rho"][row], 0.0, length, width, 0.0]),
+                SETTINGS.classes[label[row]],
+                around=reference.PointsAround(inside, top, above, ring),
+                measured_length_m=length,
+                measured_width_m=width,
+                num_members=int(columns["num_points"][row]),
+                **one,
+                **SCORE,
+            )
+        )
+    expected = np.array(expected)
+    np.testing.assert_allclose(scores, expected, rtol=2e-4, atol=1e-7)
+    assert (expected == 0).sum() > 50
+    assert (expected > 0.05).sum() > 50
+
+
+def test_overlap_of_boxes_is_that_of_opencv(cases):
+    rng = np.random.default_rng(0)
+    for case in cases:
+        boxes = boxes_of(case, rng)[-NUM_RANDOM:]
+        others = (boxes + rng.normal(0, [1, 1, 0.5, 0.2, 1], boxes.shape)).astype(np.float32)
+        others[:, 2:4] = np.abs(others[:, 2:4])
+        expected = [
+            reference.bev_iou(a, b) for a, b in zip(boxes.astype(float), others.astype(float), strict=True)
+        ]
+        parity.assert_within(rectangle_iou(boxes, others) - np.array(expected), 1e-3, "IoU")
+        assert np.std(expected) > 0.1
+
+
+def test_suppression_keeps_the_boxes_that_the_reference_keeps(cases):
+    rng = np.random.default_rng(0)
+    for case in cases:
+        boxes = boxes_of(case, rng)
+        scores = np.sort(rng.random(len(boxes)))[::-1]
+        boxes = boxes[rng.permutation(len(boxes))]
+        kept = reference.suppress(boxes.astype(float), scores, max_overlap=SETTINGS.max_overlap)
+        expected = np.isin(np.arange(len(boxes)), kept)
+        keep = suppress(
+            parity.pad(boxes, MAX_BOXES),
+            parity.padded_mask(len(boxes), MAX_BOXES),
+            max_overlap=SETTINGS.max_overlap,
+        )
+        keep = np.asarray(keep)
+        assert not keep[len(boxes) :].any()
+        # Overlaps of just the limit may round to either side of it.
+        parity.assert_share(np.sum(keep[: len(boxes)] != expected), len(boxes), 0.01, "kept boxes")
+        assert 10 < expected.sum() < len(boxes) / 2
