@@ -1,0 +1,392 @@
+"""Laws of detect(): one trace, padding, batches, symmetry, bounds; and sweeps that nobody would wish for."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbox import DetectorConfig, Label, PointCloud, Status, detect, detector, stack_clouds, synthetic
+from jaxbox.geometry import rectangle_iou
+from jaxbox.io import open_sweeps
+
+CAPACITY = 2**14
+SEEDS = range(5)
+GOOD_SCORE = 0.2
+"""Boxes that a user would act on; the others may come and go with the order of the points."""
+SAME_IOU, SAME_SIZE_M, SAME_YAW = 0.8, 0.15, np.radians(3)
+"""What counts as the same box: grids and samples of points fall otherwise when the sweep is turned."""
+
+iou = jax.jit(jax.vmap(jax.vmap(rectangle_iou, (None, 0)), (0, None)))
+
+
+@functools.cache
+def street(seed):
+    """About 15,500 points round the sensor, and twelve vehicles."""
+    return synthetic.make_sweep(seed, num_beams=32, num_azimuths=520)
+
+
+def run(xyz, *, capacity=CAPACITY, config=None, key=None):
+    cloud = PointCloud.from_numpy(np.asarray(xyz, np.float32), capacity=capacity)
+    return jax.device_get(detect(cloud, config, key))
+
+
+@functools.cache
+def found(seed):
+    return run(street(seed).xyz)
+
+
+def rectangles(detections, least_score=0.0):
+    rows = np.column_stack([detections.center[:, :2], detections.size[:, :2], detections.yaw])
+    return rows[detections.valid & (detections.score > least_score)].astype(np.float32)
+
+
+def assert_same_bits(one, other):
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def assert_same_but_for_rounding(one, other):
+    """The compiler may order float32 arithmetic otherwise within a batch; nothing else may differ."""
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(
+            a, b, rtol=1e-5 if a.dtype.kind == "f" else 0, atol=2e-5 if a.dtype.kind == "f" else 0
+        )
+
+
+def assert_well_formed(detections, num_points, capacity=CAPACITY):
+    """What holds of every answer, whatever the sweep."""
+    d, valid, counts = detections, detections.valid, detections.counts
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(d))
+    assert valid.sum() == min(counts.detections, len(valid))
+    assert not valid[valid.sum() :].any()
+    for rows in (d.center, d.size, d.yaw, d.score, d.label, d.num_points, d.hulls.num_vertices):
+        assert not rows[~valid].any()
+    assert (np.diff(d.score) <= 0).all()
+    assert ((d.score[valid] > 0) & (d.score[valid] <= 1)).all()
+    assert (d.size[valid] > 0).all()
+    assert (d.size[:, 0] >= d.size[:, 1]).all()
+    assert ((d.yaw >= -np.pi / 2) & (d.yaw < np.pi / 2)).all()
+    assert set(d.label[valid]) <= set(Label)
+    # Every point is in one place, and every mask tells the same story as its count.
+    assert counts.num_points == num_points
+    assert d.ground_mask.sum() == counts.ground_points
+    assert counts.dropped_points == max(num_points - capacity, 0)
+    assert d.point_detection.shape == d.point_component.shape == d.ground_mask.shape == (capacity,)
+    owned = np.bincount(d.point_detection + 1, minlength=len(valid) + 1)[1:]
+    np.testing.assert_array_equal(owned, d.num_points)
+    assert not (d.ground_mask & (d.point_component >= 0)).any()
+
+
+# One trace.
+
+
+def test_one_trace_serves_sweeps_of_any_length_and_any_thresholds_and_keys():
+    xyz = street(0).xyz
+    run(xyz)
+    size = detector._detect_jit._cache_size()
+    for length in (0, 1, 777, len(xyz), CAPACITY + 5):
+        run(np.resize(xyz, (length, 3)))
+    number_types = (lambda v: 1.1 * v, lambda v: int(v) + 1, np.float32, np.float64, np.asarray)
+    for seed, convert in enumerate(number_types):
+        run(xyz, config=jax.tree.map(convert, DetectorConfig()), key=jax.random.key(seed))
+    assert detector._detect_jit._cache_size() == size
+
+
+def test_one_trace_serves_all_real_sweeps(data_root):
+    folders = ("kitti_object/training", "pandaset", "argoverse2", "kitti_tracking/training")
+    sweeps = [sweep for folder in folders for sweep in open_sweeps(data_root / folder)]
+    size = detector._detect_jit._cache_size()
+    lengths = set()
+    for sweep in sweeps[:23] + sweeps[23::8]:
+        xyz = sweep.read_points()[0]
+        lengths.add(len(xyz))
+        assert_well_formed(run(xyz, capacity=2**17), len(xyz), 2**17)
+    assert detector._detect_jit._cache_size() <= size + 1
+    assert len(lengths) > 20
+
+
+def test_nothing_calls_back_to_the_host():
+    cloud = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY)
+    assert "callback" not in str(jax.make_jaxpr(detect)(cloud))
+
+
+# The same answer.
+
+
+def test_the_same_key_gives_the_same_bits_and_none_is_key_zero():
+    assert_same_bits(run(street(0).xyz, key=jax.random.key(0)), found(0))
+    assert_same_bits(run(street(0).xyz), found(0))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_twice_the_padding_gives_the_same_boxes_bit_for_bit(seed):
+    wide, narrow = run(street(seed).xyz, capacity=2 * CAPACITY), found(seed)
+    for name in (
+        "center",
+        "size",
+        "yaw",
+        "score",
+        "label",
+        "valid",
+        "num_points",
+        "ground",
+        "status",
+        "counts",
+    ):
+        assert_same_bits(getattr(wide, name), getattr(narrow, name))
+    for name in ("ground_mask", "point_component", "point_detection"):
+        np.testing.assert_array_equal(getattr(wide, name)[:CAPACITY], getattr(narrow, name))
+    # The extremes of a hull are compared in fewer bits where there are more points: a slice wide.
+    slice_m = narrow.size[:, :1].max() / DetectorConfig().hull.num_slices
+    np.testing.assert_allclose(wide.hulls.vertices, narrow.hulls.vertices, atol=slice_m)
+
+
+def test_a_batch_of_clouds_gives_the_answers_of_the_singles():
+    sweeps = [street(0).xyz, np.zeros((0, 3)), street(1).xyz]
+    batch = stack_clouds([PointCloud.from_numpy(xyz, capacity=CAPACITY) for xyz in sweeps])
+    many = jax.device_get(jax.vmap(detect)(batch))
+    for row, xyz in enumerate(sweeps):
+        assert_same_but_for_rounding(jax.tree.map(lambda leaf, row=row: leaf[row], many), run(xyz))
+
+
+def test_a_batch_of_thresholds_and_keys_gives_the_answers_of_the_singles():
+    cloud = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY)
+    scales = (1.0, 0.8, 1.3)
+    configs = [jax.tree.map(lambda v, s=scale: s * v, DetectorConfig()) for scale in scales]
+    batch = jax.tree.map(lambda *values: jnp.array(values), *configs)
+    keys = jax.random.split(jax.random.key(3), len(scales))
+    many = jax.device_get(jax.vmap(detect, (None, 0, 0))(cloud, batch, keys))
+    singles = [run(street(0).xyz, config=c, key=k) for c, k in zip(configs, keys, strict=True)]
+    for row, single in enumerate(singles):
+        assert_same_but_for_rounding(jax.tree.map(lambda leaf, row=row: leaf[row], many), single)
+    assert len({int(single.valid.sum()) for single in singles}) > 1
+
+
+# The same boxes.
+
+TURNS = {
+    "a quarter turn": [[0, -1], [1, 0]],
+    "half a turn": [[-1, 0], [0, -1]],
+    "three quarters": [[0, 1], [-1, 0]],
+    "left and right swapped": [[1, 0], [0, -1]],
+}
+
+
+def moved(boxes, turn):
+    """Boxes in a world that is turned or mirrored."""
+    heading = np.column_stack([np.cos(boxes[:, 4]), np.sin(boxes[:, 4])]) @ turn.T
+    return np.column_stack([boxes[:, :2] @ turn.T, boxes[:, 2:4], np.arctan2(heading[:, 1], heading[:, 0])])
+
+
+def assert_all_found_again(boxes, detections):
+    candidates = rectangles(detections)
+    overlap = np.asarray(iou(boxes.astype(np.float32), candidates))
+    again = candidates[overlap.argmax(axis=1)]
+    assert (overlap.max(axis=1) > SAME_IOU).all()
+    np.testing.assert_allclose(again[:, 2:4], boxes[:, 2:4], atol=SAME_SIZE_M)
+    between = (again[:, 4] - boxes[:, 4] + np.pi / 2) % np.pi - np.pi / 2
+    assert (np.abs(between) < SAME_YAW).all()
+
+
+@pytest.mark.parametrize("name", TURNS)
+@pytest.mark.parametrize("seed", SEEDS)
+def test_in_a_turned_or_mirrored_world_the_good_boxes_turn_with_it(seed, name):
+    xyz, turn = street(seed).xyz, np.array(TURNS[name], np.float32)
+    # The region is a rectangle: only what lies within it either way.
+    xyz = xyz[np.linalg.norm(xyz[:, :2], axis=1) < DetectorConfig().region.half_y_m - 1]
+    straight = rectangles(run(xyz), GOOD_SCORE)
+    assert len(straight) > 0
+    turned = run(np.column_stack([xyz[:, :2] @ turn.T, xyz[:, 2]]))
+    assert_all_found_again(moved(straight, turn), turned)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_in_any_order_of_the_points_the_good_boxes_are_found_again(seed):
+    shuffled = np.random.default_rng(seed).permutation(street(seed).xyz)
+    boxes = rectangles(found(seed), GOOD_SCORE)
+    assert len(boxes) > 0
+    assert_all_found_again(boxes, run(shuffled))
+
+
+def test_points_that_are_not_finite_change_no_box():
+    xyz = street(0).xyz
+    rng = np.random.default_rng(0)
+    bad = np.where(rng.random((300, 3)) < 0.5, rng.choice([np.nan, np.inf, -np.inf], (300, 3)), 1).astype(
+        np.float32
+    )
+    bad[:, 0] = np.nan
+    rows = np.sort(rng.integers(0, len(xyz), 300))
+    with_bad = run(np.insert(xyz, rows, bad, axis=0))
+    assert Status(int(with_bad.status)) == Status(int(found(0).status)) | Status.NONFINITE_POINTS
+    assert with_bad.counts.nonfinite_points == 300
+    for name in ("center", "size", "yaw", "score"):
+        np.testing.assert_allclose(getattr(with_bad, name), getattr(found(0), name), atol=1e-4)
+
+
+@pytest.mark.parametrize("z", [150.0, 1e10, 1e25, 3e38, -1e25])
+def test_a_point_out_of_this_world_changes_no_box(z):
+    xyz = street(0).xyz
+    high = [[5.0, 5.0, 3.5]]
+    clean = run(np.concatenate([xyz, high]))
+    worse = run(np.concatenate([xyz, high, [[5.0, 5.0, z]]]))
+    assert worse.counts.out_of_range_points == clean.counts.out_of_range_points + 1
+    for name in ("center", "size", "yaw", "score", "status"):
+        assert_same_bits(getattr(worse, name), getattr(clean, name))
+
+
+# The form of the answer.
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_streets_give_well_formed_answers_with_a_clean_status(seed):
+    assert_well_formed(found(seed), len(street(seed).xyz))
+    assert Status(int(found(seed).status)) == Status.OK
+    found(seed).raise_if_failed()
+
+
+def test_the_answer_has_the_documented_shapes_and_types():
+    d, config = found(0), DetectorConfig()
+    k, h, n, maps = (
+        config.vehicles.max_detections,
+        config.hull.max_vertices,
+        CAPACITY,
+        len(config.clustering.maps),
+    )
+    expected = {
+        "center": ((k, 3), "float32"), "size": ((k, 3), "float32"), "yaw": ((k,), "float32"),
+        "score": ((k,), "float32"), "label": ((k,), "int32"), "valid": ((k,), "bool"),
+        "num_points": ((k,), "int32"), "hulls.vertices": ((k, h, 2), "float32"),
+        "hulls.num_vertices": ((k,), "int32"), "descriptors.moment_of_inertia": ((k, 2), "float32"),
+        "descriptors.eccentricity": ((k,), "float32"), "descriptors.density": ((k,), "float32"),
+        "descriptors.complexity": ((k,), "float32"), "ground.coefficients": ((3,), "float32"),
+        "ground.found": ((), "bool"), "ground.num_inliers": ((), "int32"), "ground_mask": ((n,), "bool"),
+        "point_component": ((n,), "int32"), "point_detection": ((n,), "int32"), "status": ((), "int32"),
+        "counts.cells": ((maps,), "int32"), "counts.clusters": ((maps,), "int32"),
+    }  # fmt: skip
+    for field in dataclasses.fields(d.counts):
+        expected.setdefault(f"counts.{field.name}", ((), "int32"))
+    paths = jax.tree_util.tree_flatten_with_path(d)[0]
+    assert {jax.tree_util.keystr(path)[1:]: (leaf.shape, leaf.dtype) for path, leaf in paths} == expected
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_hulls_turn_left_and_lie_within_their_boxes(seed):
+    d = found(seed)
+    for row in np.flatnonzero(d.valid):
+        hull = d.hulls.vertices[row, : d.hulls.num_vertices[row]].astype(np.float64)
+        cos, sin = np.cos(d.yaw[row]), np.sin(d.yaw[row])
+        local = (hull - d.center[row, :2]) @ np.array([[cos, -sin], [sin, cos]])
+        # A point on the face, give or take a millimetre, is inside; so is float32 at 80 m.
+        assert (np.abs(local) <= d.size[row, :2] / 2 + 2e-3).all()
+        edge, following = np.roll(hull, -1, 0) - hull, np.roll(hull, -2, 0) - np.roll(hull, -1, 0)
+        assert (edge[:, 0] * following[:, 1] - edge[:, 1] * following[:, 0] > -1e-5).all()
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_points_of_a_detection_lie_within_its_box(seed):
+    d, xyz = found(seed), street(seed).xyz
+    rows = d.point_detection[: len(xyz)]
+    assert (d.point_detection[len(xyz) :] == -1).all()
+    points, rows = xyz[rows >= 0], rows[rows >= 0]
+    offset = points[:, :2] - d.center[rows, :2]
+    cos, sin = np.cos(d.yaw[rows]), np.sin(d.yaw[rows])
+    local = np.column_stack(
+        [offset[:, 0] * cos + offset[:, 1] * sin, offset[:, 1] * cos - offset[:, 0] * sin]
+    )
+    assert (np.abs(local) <= d.size[rows, :2] / 2 + 2e-3).all()
+
+
+def test_vehicles_with_many_points_are_found():
+    hits, total = 0, 0
+    for seed in SEEDS:
+        truth = street(seed).boxes
+        boxes = np.column_stack([truth.center[:, :2], truth.size[:, :2], truth.yaw])[truth.num_points >= 60]
+        overlap = np.asarray(iou(boxes.astype(np.float32), rectangles(found(seed), 0.1)))
+        hits, total = hits + (overlap.max(axis=1) > 0.5).sum(), total + len(boxes)
+    assert total > 20
+    assert hits / total > 0.85
+
+
+def test_the_ground_is_the_streets():
+    for seed in SEEDS:
+        sweep, d = street(seed), found(seed)
+        mask = d.ground_mask[: len(sweep.xyz)]
+        assert bool(d.ground.found)
+        assert mask[sweep.is_ground].mean() > 0.99
+        assert sweep.is_ground[mask].mean() > 0.9
+
+
+# Bad input.
+
+RNG = np.random.default_rng(7)
+NO_BOX = {
+    "empty": (np.zeros((0, 3)), Status.EMPTY | Status.NO_GROUND),
+    "one point": (np.array([[8.0, 2, -1]]), Status.NO_GROUND),
+    "two points": (np.array([[8.0, 2, -1], [8.2, 2, -1]]), Status.NO_GROUND),
+    "three points": (np.array([[8.0, 2, -1], [8.2, 2, -1], [8, 2.1, -0.9]]), Status.NO_GROUND),
+    "all equal": (np.tile([9.0, 3, -1], (500, 1)), Status.NO_GROUND),
+    "all at the sensor": (np.zeros((500, 3)), Status.NO_GROUND),
+    "all NaN": (np.full((500, 3), np.nan), Status.EMPTY | Status.NO_GROUND | Status.NONFINITE_POINTS),
+    "all infinite": (np.full((500, 3), -np.inf), Status.EMPTY | Status.NO_GROUND | Status.NONFINITE_POINTS),
+    "huge": (RNG.normal(0, 1e30, (500, 3)), Status.EMPTY | Status.NO_GROUND),
+    "largest floats": (np.full((500, 3), np.finfo(np.float32).max), Status.EMPTY | Status.NO_GROUND),
+    "tiny": (RNG.normal(0, 1e-38, (500, 3)), Status.NO_GROUND),
+    "a line": (np.linspace([-50, -20, -1.7], [50, 20, -1.7], 5000), None),
+    "a plumb line": (
+        np.tile([9.0, 3, 0], (500, 1)) + np.linspace(-2, 2, 500)[:, None] * [0, 0, 1],
+        Status.NO_GROUND,
+    ),
+    "a level sheet": (RNG.uniform([-50, -50, -1.7], [50, 50, -1.7], (5000, 3)), Status.OK),
+    "beyond the region": (RNG.uniform(90, 99, (500, 3)), Status.EMPTY | Status.NO_GROUND),
+    "only ground": (synthetic.ground_only_sweep().xyz[::8], Status.OK),
+}
+
+
+@pytest.mark.parametrize("name", NO_BOX)
+def test_sweeps_without_a_vehicle_give_no_box_and_the_right_bits(name):
+    xyz, status = NO_BOX[name]
+    detections = run(xyz)
+    assert_well_formed(detections, len(xyz))
+    assert not detections.valid.any()
+    assert status is None or Status(int(detections.status)) == status
+    detections.raise_if_failed()
+
+
+HARD = {
+    "noise": RNG.uniform(-70, 70, (16000, 3)),
+    "dense noise": RNG.uniform([-15, -15, -2], [15, 15, 2], (16000, 3)),
+    "a wall": synthetic.one_wall_sweep().xyz[::4],
+    "no ground": synthetic.no_ground_sweep().xyz[::8],
+    "rounded to 1 m": np.round(street(0).xyz),
+    "upside down": street(0).xyz * np.float32([1, 1, -1]),
+    "on its side": street(0).xyz[:, [0, 2, 1]],
+    "one beam": street(0).xyz[np.abs(street(0).xyz[:, 2] + 0.9) < 0.05],
+    "each point twice": np.repeat(street(0).xyz[::2], 2, axis=0),
+    "mixed faults": np.where(RNG.random((9000, 3)) < 0.1, RNG.choice([np.nan, np.inf, 1e30], (9000, 3)), 5.0),
+}
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_sweeps_of_another_world_give_well_formed_answers(name):
+    assert_well_formed(run(HARD[name]), len(HARD[name]))
+
+
+def test_a_wall_is_no_vehicle():
+    assert not len(rectangles(run(HARD["a wall"]), GOOD_SCORE))
+
+
+def test_a_sweep_larger_than_its_cloud_loses_the_farthest_points():
+    xyz = np.concatenate([street(0).xyz, street(1).xyz + np.float32([0, 0, 0.001])])
+    detections = run(xyz)
+    assert_well_formed(detections, len(xyz))
+    assert Status.POINT_OVERFLOW in Status(int(detections.status))
+    assert detections.counts.out_of_range_points == 0
+
+
+def test_vehicles_are_found_where_the_ground_returns_nothing():
+    sweep = synthetic.no_ground_sweep()
+    detections = run(sweep.xyz[::4], capacity=2 * CAPACITY)
+    assert rectangles(detections, GOOD_SCORE).shape[0] > 0
