@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from jaxbox import DetectorConfig, PointCloud, Status, detect
-from jaxbox.config import CAPACITY_STEP, ComponentMap, RegionConfig
+from jaxbox.capacities import CAPACITY_STEP
+from jaxbox.config import ComponentMap, RegionConfig
 from jaxbox.io import open_sweeps
 from jaxbox.synthetic import make_sweep
 
