@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxbox.masked import fold_points, group_by, map_rows
 from jaxbox.types import Rectangles
 
-CHUNK = 64
+CHUNK = 256
 """Clusters at a time: their extents at all rotations stay in the cache."""
 
 VOTE_POINTS, VOTE_EXTENT_M = 150.0, 6.0

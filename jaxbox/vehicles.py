@@ -18,7 +18,7 @@ MAX_CELL_ROWS = 24
 LOOKUP_STEP = 128
 """Points looked at in one go."""
 
-BOX_CHUNK = 16
+BOX_CHUNK = 32
 """Boxes looked at together: the loop over their points ends with the one that has most."""
 
 OVERLAP_CHUNK = 32
