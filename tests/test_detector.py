@@ -144,25 +144,25 @@ def test_twice_the_padding_gives_the_same_boxes_bit_for_bit(seed):
     np.testing.assert_allclose(wide.hulls.vertices, narrow.hulls.vertices, atol=slice_m)
 
 
-def test_a_batch_of_clouds_gives_the_answers_of_the_singles():
-    sweeps = [street(0).xyz, np.zeros((0, 3)), street(1).xyz]
-    batch = stack_clouds([PointCloud.from_numpy(xyz, capacity=CAPACITY) for xyz in sweeps])
-    many = jax.device_get(jax.vmap(detect)(batch))
-    for row, xyz in enumerate(sweeps):
-        assert_same_but_for_rounding(jax.tree.map(lambda leaf, row=row: leaf[row], many), run(xyz))
-
-
-def test_a_batch_of_thresholds_and_keys_gives_the_answers_of_the_singles():
-    cloud = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY)
-    scales = (1.0, 0.8, 1.3)
+def test_a_batch_of_sweeps_thresholds_and_keys_gives_the_answers_of_the_singles():
+    sweeps = [street(0).xyz, np.zeros((0, 3)), street(1).xyz, street(0).xyz]
+    scales = (1.0, 0.8, 1.3, 0.9)
     configs = [jax.tree.map(lambda v, s=scale: s * v, DetectorConfig()) for scale in scales]
-    batch = jax.tree.map(lambda *values: jnp.array(values), *configs)
     keys = jax.random.split(jax.random.key(3), len(scales))
-    many = jax.device_get(jax.vmap(detect, (None, 0, 0))(cloud, batch, keys))
-    singles = [run(street(0).xyz, config=c, key=k) for c, k in zip(configs, keys, strict=True)]
-    for row, single in enumerate(singles):
+    clouds = stack_clouds([PointCloud.from_numpy(xyz, capacity=CAPACITY) for xyz in sweeps])
+    batch = jax.tree.map(lambda *values: jnp.array(values), *configs)
+    many = jax.device_get(jax.vmap(detect)(clouds, batch, keys))
+    for row, (xyz, config, key) in enumerate(zip(sweeps, configs, keys, strict=True)):
+        single = run(xyz, config=config, key=key)
         assert_same_but_for_rounding(jax.tree.map(lambda leaf, row=row: leaf[row], many), single)
-    assert len({int(single.valid.sum()) for single in singles}) > 1
+    assert len(set(many.valid.sum(axis=1))) == len(sweeps)
+
+
+def test_a_batch_of_clouds_alone_has_the_shapes_of_the_singles_and_an_axis_more():
+    clouds = stack_clouds([PointCloud.from_numpy(street(seed).xyz, capacity=CAPACITY) for seed in (0, 1)])
+    batch = jax.eval_shape(jax.vmap(detect), clouds)
+    for leaf, single in zip(jax.tree.leaves(batch), jax.tree.leaves(found(0)), strict=True):
+        assert (leaf.shape, leaf.dtype) == ((2, *single.shape), single.dtype)
 
 
 # The same boxes.

@@ -202,8 +202,8 @@ SMALL = DetectorConfig(
     ground=GroundConfig(surface=False),
     clustering=ClusteringConfig(
         maps=(
-            ComponentMap(cell_m=0.35, max_cells=1080, max_clusters=50),
-            ComponentMap(cell_m=0.5, max_cells=750, max_clusters=55),
+            ComponentMap(cell_m=0.35, max_cells=1080, max_clusters=40),
+            ComponentMap(cell_m=0.5, max_cells=750, max_clusters=40),
         ),
         max_obstacles=6500,
     ),
@@ -211,7 +211,7 @@ SMALL = DetectorConfig(
     hull=HullConfig(max_vertices=8),
     box=BoxConfig(scene_direction=False, num_angles=18, max_slab_points=1900),
     completion=CompletionConfig(mode="none"),
-    vehicles=VehicleConfig(max_large=40, max_candidates=16, max_detections=6),
+    vehicles=VehicleConfig(max_large=30, max_candidates=8, max_detections=3),
 )
 CAPACITY_BITS = (
     Status.OBSTACLE_OVERFLOW
@@ -223,7 +223,7 @@ CAPACITY_BITS = (
 )
 SEEN_WHOLE = ("clustering.max_obstacles", "clustering.maps[i].max_cells")
 """Counted before anything is dropped here; the others count what is left of the stage before."""
-HIDDEN = 1.5
+HIDDEN = 3
 """Dropped points hide clusters, and those hide boxes: sizes of what may hide are enlarged by more."""
 MAX_ROUNDS = 4
 """A run that sees more may ask for more; as a rule the second is clean."""
@@ -238,7 +238,7 @@ def sizes_named(message):
 def enlarged(config, sizes):
     """The configuration with each field that is named large enough, and none smaller than it was."""
     for field, exact in sizes.items():
-        needed = exact if field in SEEN_WHOLE else [int(HIDDEN * size) for size in exact]
+        needed = exact if field in SEEN_WHOLE else [HIDDEN * size for size in exact]
         part, name = field.split(".")[0], field.split(".")[-1]
         old = getattr(config, part)
         if "maps[i]" in field:
