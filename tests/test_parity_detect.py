@@ -39,30 +39,52 @@ def detect(case, preset):
     return parity.on_host(jaxbox.detect(cloud, PRESETS[preset]))
 
 
-def missing(cases, preset, use_plane):
+def both(cases, preset, use_plane):
+    """Detections of jaxbox and of the reference, for some of the sweeps."""
+    for case in cases[SWEEPS]:
+        ours = detect(case, preset)
+        use_plane(ours.ground)
+        yield ours, reference.detect(case.xyz, PRESETS[preset])
+
+
+def missing(pairs):
     """Boxes that count and have no partner, and boxes that count; of jaxbox and the reference together."""
     total = np.zeros(2, int)
-    for case in cases[SWEEPS]:
-        detections = detect(case, preset)
-        use_plane(detections.ground)
-        ours, theirs = boxes_of(detections), boxes_of(reference.detect(case.xyz, PRESETS[preset]))
-        total += num_partners(ours, theirs) + num_partners(theirs, ours)
+    for ours, theirs in pairs:
+        boxes, others = boxes_of(ours), boxes_of(theirs)
+        total += num_partners(boxes, others) + num_partners(others, boxes)
     return total[0] - total[1], total[0]
 
 
+def owners_of(detections, num_points):
+    """(n, 2) m: centre of the box that each point belongs to; far away for points of no box that counts."""
+    row = np.asarray(detections.point_detection)[:num_points]
+    owned = (row >= 0) & (detections.score[row] > MIN_SCORE)
+    return np.where(owned[:, None], detections.center[row, :2], 1e6)
+
+
 @pytest.mark.parametrize("preset", list(PRESETS))
-def test_on_one_ground_plane_both_find_the_same_boxes(cases, preset, monkeypatch):
+def test_on_one_ground_plane_both_find_the_same_boxes_of_the_same_points(cases, preset, monkeypatch):
     def use_plane(plane):
         fit = plane.coefficients.astype(float), bool(plane.found), int(plane.num_inliers)
         monkeypatch.setattr(reference_detector, "fit_ground_planes", lambda *_, **__: [fit])
 
-    bad, total = missing(cases, preset, use_plane)
+    pairs = list(both(cases, preset, use_plane))
+    bad, total = missing(pairs)
     assert total > 15
     parity.assert_share(bad, total, 0.02, f"boxes of {preset}, on one plane")
+    for ours, theirs in pairs:
+        count = len(theirs.ground_mask)
+        ground = ours.ground_mask[:count] != theirs.ground_mask
+        parity.assert_share(ground.sum(), count, 1e-4, f"ground of {preset}")
+        first, second = owners_of(ours, count), owners_of(theirs, count)
+        owned = (first[:, 0] < 1e6) | (second[:, 0] < 1e6)
+        apart = np.abs(first - second).max(axis=1) > 0.1
+        parity.assert_share(apart.sum(), owned.sum(), 0.005, f"points of the boxes of {preset}")
 
 
 @pytest.mark.parametrize(("preset", "limit"), [("default", 0.15), ("paper", 0.4)])
 def test_on_planes_of_their_own_most_boxes_are_the_same(cases, preset, limit):
     # The paper's candidates hold walls too, so that its plane, and with it every height, is less sure.
-    bad, total = missing(cases, preset, use_plane=lambda plane: None)
+    bad, total = missing(both(cases, preset, use_plane=lambda plane: None))
     parity.assert_share(bad, total, limit, f"boxes of {preset}, each on its own plane")
