@@ -360,13 +360,13 @@ class VehicleConfig:
     """Clusters higher than this are also tried as a van or a truck."""
     large_clearance_m: Scalar = 0.8
     """Clusters that begin higher than this above the ground are not: they are trees, say."""
-    max_large: int = _static(default=512)
+    max_large: int = _static(default=768)
     """static: capacity for clusters also tried as a van or a truck."""
-    max_candidates: int = _static(default=512)
+    max_candidates: int = _static(default=1024)
     """static: capacity for boxes that pass the gates, before suppression."""
     max_detections: int = _static(default=128)
     """static: K, capacity for boxes in the answer."""
-    max_nearby: int = _static(default=2048)
+    max_nearby: int = _static(default=4096)
     """static: points looked at round a box; where there are more, every so many are and count so
     many times."""
     margin_m: Scalar = 0.1
@@ -423,7 +423,7 @@ class DetectorConfig:
     def paper(cls) -> "DetectorConfig":
         """The paper's own choices: one plane, fixed tolerance, smallest area, no completion."""
         return cls(
-            ground=GroundConfig(candidates="points", surface=False, min_height_m=0.2),
+            ground=GroundConfig(candidates="points", surface=False, tolerance_m=0.2, min_height_m=0.2),
             clustering=ClusteringConfig(
                 maps=(ComponentMap(cell_m=0.35, num_levels=8, max_cells=24576),), adaptive_growth=0.0
             ),
