@@ -88,7 +88,7 @@ def time_steps(clouds: Sequence[PointCloud], config: DetectorConfig) -> dict[str
         seen = run("build_evidence", sweep, heights, config)
         trials, boxes = run("complete_boxes", fits, proposals, seen, config)
         candidates = run("score_boxes", trials, boxes, proposals, obstacles, heights, seen, config)
-        run("conclude", cloud, sweep, heights, obstacles, proposals, candidates, config)
+        run("conclude", cloud, sweep, heights, obstacles, proposals, fits, candidates, config)
     return {name: spread(values) for name, values in spent.items()}
 
 

@@ -18,7 +18,7 @@ VOTE_POINTS, VOTE_EXTENT_M = 150.0, 6.0
 Extents = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
 """Lower and upper bounds of u, then of v, each (C, A)."""
 
-Clusters = tuple[jax.Array, jax.Array]
+PointTable = tuple[jax.Array, jax.Array]
 """Points (C, M, 2) m and how many of them count (C,)."""
 
 
@@ -77,7 +77,7 @@ def try_rotations(
     angle = jnp.arange(num_angles) * (math.pi / 2 / num_angles)
     cos, sin = jnp.cos(angle), jnp.sin(angle)
 
-    def rate(clusters: Clusters) -> tuple[jax.Array, Extents]:
+    def rate(clusters: PointTable) -> tuple[jax.Array, Extents]:
         extents = _extents(*clusters, cos, sin)
         return _CRITERIA[criterion](clusters, cos, sin, extents, min_distance_m), extents
 
@@ -96,14 +96,14 @@ def _extents(points: jax.Array, count: jax.Array, cos: jax.Array, sin: jax.Array
 
 
 def _area(
-    clusters: Clusters, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
+    clusters: PointTable, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
 ) -> jax.Array:
     u0, u1, v0, v1 = extents
     return -(u1 - u0) * (v1 - v0)
 
 
 def _closeness(
-    clusters: Clusters, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
+    clusters: PointTable, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
 ) -> jax.Array:
     u0, u1, v0, v1 = extents
 
@@ -114,7 +114,7 @@ def _closeness(
 
 
 def _visible_closeness(
-    clusters: Clusters, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
+    clusters: PointTable, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
 ) -> jax.Array:
     u0, u1, v0, v1 = extents
     # The sensor is the origin: of two opposite edges it sees the one nearer to 0.
@@ -128,7 +128,7 @@ def _visible_closeness(
 
 
 def _mean_closeness(
-    clusters: Clusters,
+    clusters: PointTable,
     cos: jax.Array,
     sin: jax.Array,
     distance: Callable[[jax.Array, jax.Array], jax.Array],
@@ -143,7 +143,7 @@ def _mean_closeness(
 
 
 def _variance(
-    clusters: Clusters, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
+    clusters: PointTable, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
 ) -> jax.Array:
     u0, u1, v0, v1 = extents
 

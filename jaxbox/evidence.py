@@ -23,6 +23,9 @@ FREE_AFTER_M, FREE_BEFORE_M = 0.3, 0.2
 DEEP_BEYOND_M = 0.1
 """A return later than a hit, up to this past the exit, is a deep one: through a window, say."""
 
+MAX_HITS = 32_000
+"""Hits of one azimuth that the sums can hold."""
+
 MIN_ENTRY_M = 1.0
 """Rays that enter a box nearer than this say nothing: the sensor is all but inside."""
 
@@ -126,6 +129,8 @@ def build_evidence(
     beams = scatter(first, is_free, empty)
     beams = scatter(jnp.maximum(last, 0), -is_free.astype(jnp.int32), beams)
 
+    # Clipped, so that the sums over range stay within int16 whatever the sweep repeats.
+    hits = jnp.minimum(hits, MAX_HITS // num_ranges)
     shape = (num_ranges + 1, num_azimuths)
     free, hit = _prefix_over_range(beams.reshape(shape), hits.reshape(shape))
     return Evidence(free, hit, _ground_support(xyz, height, mask, support_height_m))

@@ -56,7 +56,8 @@ def _argmax_per_cell(cell: jax.Array, value: jax.Array, num_cells: int) -> jax.A
     """
     size = cell.shape[0]
     index_bits = size.bit_length()
-    value_bits = 32 - index_bits
+    # More bits than float32 holds would round the largest value up, out of the word.
+    value_bits = min(32 - index_bits, 24)
     quantised = (value * (2**value_bits - 1)).astype(jnp.uint32)
     key = (quantised << index_bits) | (jnp.arange(size, dtype=jnp.uint32) + 1)
     best = jnp.zeros(num_cells, jnp.uint32).at[cell].max(key, mode="drop")

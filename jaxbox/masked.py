@@ -59,11 +59,11 @@ def compact(mask: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
 
 
 def take(rows: jax.Array, index: jax.Array, fill: Any = 0) -> jax.Array:
-    """Rows at the indices, and `fill` at the sentinel or any other index outside.
+    """Rows at the indices, and `fill` at the sentinel or any other index beyond.
 
     Args:
       rows: (N, ...).
-      index: (...) int32.
+      index: (...) int32, not negative.
       fill: what an absent row holds.
 
     Returns:

@@ -41,7 +41,7 @@ class Status(enum.IntFlag):
         """Returns one sentence a set bit: what happened and what to do about it.
 
         >>> Status.NO_GROUND.describe()
-        ['NO_GROUND: no plane had enough support; heights are taken from the lowest point instead.']
+        ['NO_GROUND: no plane had enough support; heights are taken from the lowest candidate instead.']
         """
         return [f"{bit.name}: {_STATUS_TEXT[bit]}" for bit in _STATUS_TEXT if bit in self]
 
@@ -51,7 +51,7 @@ _STATUS_TEXT = {
     Status.NONFINITE_POINTS: "points with NaN or infinite coordinates were ignored.",
     Status.POINT_OVERFLOW: "the sweep has more points than the cloud's capacity; the farthest "
     "were dropped. Use PointCloud.from_numpy(..., capacity=...) with a larger capacity.",
-    Status.NO_GROUND: "no plane had enough support; heights are taken from the lowest point instead.",
+    Status.NO_GROUND: "no plane had enough support; heights are taken from the lowest candidate instead.",
     Status.OBSTACLE_OVERFLOW: "more points above the ground than clustering.max_obstacles (or, for "
     "the points a box is fitted to, box.max_slab_points); the last in the sweep's order were dropped.",
     Status.CELL_OVERFLOW: "a component map has more occupied cells than its max_cells; "
@@ -59,7 +59,7 @@ _STATUS_TEXT = {
     Status.CLUSTER_OVERFLOW: "a component map has more clusters than its max_clusters, and those beyond it "
     "were not examined; or more clusters are high than vehicles.max_large, and those beyond it were "
     "tried as cars only.",
-    Status.CANDIDATE_OVERFLOW: "more boxes passed the gates than vehicles.max_candidates; "
+    Status.CANDIDATE_OVERFLOW: "more boxes scored well by rays and size than vehicles.max_candidates; "
     "the lowest-scoring were dropped.",
     Status.DETECTION_OVERFLOW: "more detections than vehicles.max_detections; "
     "the lowest-scoring were dropped.",
@@ -189,7 +189,8 @@ class GroundPlane:
     coefficients: jax.Array
     """(3,) float32: a, b (slopes, unitless) and c (m, minus the sensor's height)."""
     found: jax.Array
-    """() bool: False where no plane had enough support; then a = b = 0 and c is the lowest z."""
+    """() bool: False where no plane had enough support; then a = b = 0 and c is that of the lowest
+    candidate, or 0 where there is none."""
     num_inliers: jax.Array
     """() int32: candidates within the tolerance of the plane."""
 
@@ -302,7 +303,7 @@ class Counts:
     outlier_points: jax.Array
     """() int32: points that the statistical filter removed."""
     ground_points: jax.Array
-    """() int32: points on or below the ground."""
+    """() int32: points lower than ground.min_height_m above the ground."""
     overhead_points: jax.Array
     """() int32: points higher above the ground than any vehicle."""
     dropped_obstacles: jax.Array
@@ -314,7 +315,8 @@ class Counts:
     obstacles: jax.Array
     """() int32: points above the ground, which clustering.max_obstacles must hold."""
     slab_points: jax.Array
-    """() int32: points between the heights a box is fitted to, which box.max_slab_points must hold."""
+    """() int32: points of clusters that boxes are fitted to, in the map with most of them, which
+    box.max_slab_points must hold."""
     cells: jax.Array
     """(maps,) int32: occupied cells of each component map."""
     clusters: jax.Array
@@ -323,7 +325,8 @@ class Counts:
     """() int32: clusters of all maps that are tried as a van and a truck too, which vehicles.max_large
     must hold."""
     candidates: jax.Array
-    """() int32: boxes that pass the gates, before suppression."""
+    """() int32: boxes whose score by rays and size passes vehicles.min_score, before a look at what
+    surrounds them, which vehicles.max_candidates must hold."""
     detections: jax.Array
     """() int32: boxes after suppression."""
     hull_vertices: jax.Array
@@ -354,7 +357,7 @@ class Detections:
     valid: jax.Array
     """(K,) bool: True for a box, False for padding."""
     num_points: jax.Array
-    """(K,) int32: points of the box's cluster inside the box."""
+    """(K,) int32: points of the box's cluster inside the box that no better box owns; it can be 0."""
     hulls: Hulls
     """Hull of those points."""
     descriptors: Descriptors
@@ -362,7 +365,7 @@ class Detections:
     ground: GroundPlane
     """The ground plane."""
     ground_mask: jax.Array
-    """(N,) bool: points on or below the ground."""
+    """(N,) bool: points lower than ground.min_height_m above the ground."""
     point_component: jax.Array
     """(N,) int32: connected component of each point in the first map, -1 where it has none."""
     point_detection: jax.Array
@@ -374,6 +377,8 @@ class Detections:
 
     def raise_if_failed(self) -> None:
         """Raises where anything was dropped for want of capacity, naming the field to enlarge.
+
+        It takes the answer of one sweep: of a batch, take one row by `jax.tree.map` first.
 
         Raises:
           RuntimeError: one line a failure, with the configuration field and the size needed.

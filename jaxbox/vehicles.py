@@ -18,6 +18,9 @@ MAX_CELL_ROWS = 24
 LOOKUP_STEP = 128
 """Points looked at in one go."""
 
+COUNT_BITS = 10
+"""Bits that hold a count of up to `LOOKUP_STEP` points."""
+
 BOX_CHUNK = 32
 """Boxes looked at together: the loop over their points ends with the one that has most."""
 
@@ -141,17 +144,21 @@ def _count_runs(
         out_v = jnp.abs(dy * cos - dx * sin) - boxes[:, 3:4] / 2
         out = jnp.where(place < total[:, None], jnp.maximum(out_u, out_v), jnp.inf)
         low = p[..., 2] < count_max_height_m[:, None]
-        inside, ring = out < margin_m, (out >= margin_m) & (out < ring_m) & low
-
-        def add(kind: jax.Array) -> jax.Array:
-            return stride * jnp.sum(kind, axis=1).astype(jnp.float32)
-
+        inside = out < margin_m
+        # A point is of one kind at most, so that one sum counts all three: each has its own bits.
+        kind = jnp.where(inside, jnp.where(low, 1, 1 << COUNT_BITS), 0)
+        kind = jnp.where(~inside & (out < ring_m) & low, 1 << 2 * COUNT_BITS, kind)
+        counts = jnp.sum(kind, axis=1)
         top = jnp.max(jnp.where(inside & low, p[..., 2], 0), axis=1)
+
+        def add(place: int) -> jax.Array:
+            return stride * ((counts >> place * COUNT_BITS) & (2**COUNT_BITS - 1)).astype(jnp.float32)
+
         return Surroundings(
-            state.num_inside + add(inside & low),
-            jnp.maximum(state.top, top),
-            state.num_above + add(inside & ~low),
-            state.num_ring + add(ring),
+            num_inside=state.num_inside + add(0),
+            top=jnp.maximum(state.top, top),
+            num_above=state.num_above + add(1),
+            num_ring=state.num_ring + add(2),
         )
 
     zero = jnp.zeros(boxes.shape[0])

@@ -311,3 +311,14 @@ def test_the_cache_folder_follows_the_environment():
     assert cache.enable_cache({"JAXBOX_CACHE_DIR": ""}) is None
     assert cache.enable_cache({"JAXBOX_CACHE_DIR": "/proc/no/such"}) is None
     assert cache.enable_cache({"JAX_COMPILATION_CACHE_DIR": "/z"}) == pathlib.Path("/z")
+
+
+def test_results_without_scores_end_with_exit_code_2_and_the_file(kitti_folder, detected, tmp_path):
+    folder = tmp_path / "results"
+    shutil.copytree(detected[0], folder)
+    file = next(file for file in sorted(folder.glob("*.txt")) if file.read_text())
+    rows = [line.rsplit(" ", 1)[0] for line in file.read_text().splitlines()]
+    file.write_text("\n".join(rows) + "\n")
+    result = run("eval", "--labels", kitti_folder, "--results", folder)
+    assert result.exit_code == 2
+    assert str(file) in result.stderr.replace("\n", "")

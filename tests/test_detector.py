@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxbox import DetectorConfig, Label, PointCloud, Status, detect, detector, stack_clouds, synthetic
+from jaxbox.config import BoxConfig, EvidenceConfig
 from jaxbox.geometry import rectangle_iou
 from jaxbox.io import open_sweeps
 
@@ -390,3 +391,16 @@ def test_vehicles_are_found_where_the_ground_returns_nothing():
     sweep = synthetic.no_ground_sweep()
     detections = run(sweep.xyz[::4], capacity=2 * CAPACITY)
     assert rectangles(detections, GOOD_SCORE).shape[0] > 0
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"evidence": EvidenceConfig(enabled=False)}, "evidence.enabled"),
+        ({"box": BoxConfig(criterion="area")}, "box.criterion"),
+    ],
+)
+def test_settings_that_contradict_each_other_are_refused_by_name(change, field):
+    cloud = PointCloud.from_numpy(np.zeros((1, 3)))
+    with pytest.raises(ValueError, match=field):
+        detect(cloud, DetectorConfig(**change))

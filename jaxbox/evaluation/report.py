@@ -90,7 +90,15 @@ def _read_results(
             f"{folder}: no result file for {len(missing)} of {len(names)} labelled sweeps, the first is "
             f"{missing[0]}.txt. Detect in them too, or take missing files for empty ones."
         )
-    return {name: None if name in missing else read_labels(file) for name, file in files.items()}
+    return {name: None if name in missing else _read_scored(file) for name, file in files.items()}
+
+
+def _read_scored(file: pathlib.Path) -> list[KittiObject]:
+    objects = read_labels(file)
+    for line, item in enumerate(objects, 1):
+        if item.score is None:
+            raise InputError(f"{file}: object {line} has no score; a result has 16 columns, the last is it.")
+    return objects
 
 
 def count_label_points(sweep: Sweep, labels: Sequence[KittiObject]) -> np.ndarray:

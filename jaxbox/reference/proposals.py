@@ -170,7 +170,9 @@ def is_large(proposal: Proposal, settings: Any) -> bool:
       True for those.
     """
     vehicles = settings.vehicles
-    return proposal.top_m > vehicles.large_height_m and proposal.bottom_m < vehicles.large_clearance_m
+    stands = proposal.bottom_m < vehicles.large_clearance_m
+    enough = len(proposal.members) >= vehicles.large_min_points
+    return stands and enough and proposal.top_m > vehicles.large_height_m
 
 
 def _complete(

@@ -2,12 +2,14 @@
 
 from jaxbox.steps.answer import conclude
 from jaxbox.steps.boxes import build_evidence, complete_boxes, fit_rectangles
+from jaxbox.steps.common import check_settings
 from jaxbox.steps.decision import score_boxes
 from jaxbox.steps.points import gather_obstacles, remove_ground, select_points
 from jaxbox.steps.proposals import propose_clusters
 
 __all__ = [
     "build_evidence",
+    "check_settings",
     "complete_boxes",
     "conclude",
     "fit_rectangles",

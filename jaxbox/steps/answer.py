@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxbox import descriptors, hull, vehicles
 from jaxbox.config import DetectorConfig
 from jaxbox.masked import compact, map_rows, store, take
-from jaxbox.steps.boxes import HULL_CHUNK, max_slab_points, trace_hulls
+from jaxbox.steps.boxes import HULL_CHUNK, Fits, max_slab_points, trace_hulls
 from jaxbox.steps.decision import Candidates
 from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals
@@ -25,6 +25,7 @@ def conclude(
     heights: Heights,
     obstacles: Obstacles,
     proposals: Proposals,
+    fits: Fits,
     candidates: Candidates,
     config: DetectorConfig,
 ) -> Detections:
@@ -46,7 +47,8 @@ def conclude(
     )
     center = jnp.concatenate([kept.rectangle[:, :2], (kept.bottom + kept.height / 2)[:, None]], axis=1)
     size = jnp.concatenate([kept.rectangle[:, 2:4], kept.height[:, None]], axis=1)
-    counts = _counts(cloud, sweep, heights, obstacles, proposals, candidates, num, num_vertices, config)
+    largest_hull = jnp.maximum(jnp.max(num_vertices), fits.hull_vertices)
+    counts = _counts(cloud, sweep, heights, obstacles, proposals, candidates, num, largest_hull, config)
 
     def per_point(value: jax.Array, absent: int) -> jax.Array:
         everywhere = jnp.full(sweep.xyz.shape[0], absent, jnp.int32)
@@ -97,7 +99,7 @@ def _counts(
     proposals: Proposals,
     candidates: Candidates,
     num_detections: jax.Array,
-    num_vertices: jax.Array,
+    largest_hull: jax.Array,
     config: DetectorConfig,
 ) -> Counts:
     num = functools.partial(jnp.sum, dtype=jnp.int32)
@@ -121,7 +123,7 @@ def _counts(
         large_clusters=proposals.num_large,
         candidates=candidates.num,
         detections=num_detections,
-        hull_vertices=jnp.max(num_vertices),
+        hull_vertices=largest_hull,
     )
 
 
@@ -143,7 +145,7 @@ def _status(
         Status.POINT_OVERFLOW: counts.dropped_points > 0,
         Status.NO_GROUND: ~heights.plane.found,
         Status.OBSTACLE_OVERFLOW: (counts.dropped_obstacles > 0)
-        | (counts.slab_points > max_slab_points(capacity, config)),
+        | ((config.box.fit_to == "slab") & (counts.slab_points > max_slab_points(capacity, config))),
         Status.CELL_OVERFLOW: jnp.any(counts.cells > max_cells),
         Status.CLUSTER_OVERFLOW: jnp.any(counts.clusters > max_clusters)
         | (counts.large_clusters > settings.max_large),

@@ -14,7 +14,7 @@ from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals, Trials, list_trials
 from jaxbox.types import NOT_A_BOX, Boxes, Rectangles
 
-PROPOSAL_CHUNK = 256
+PROPOSAL_CHUNK = 512
 """Proposals held against the evidence at a time: a loop over their points has few, wide steps."""
 
 
@@ -31,13 +31,14 @@ class Fits:
     extents: box.Extents
     points: jax.Array  # (P, M, 2) m
     count: jax.Array  # (P,)
+    hull_vertices: jax.Array  # () of the largest hull that was fitted to; 0 where none was
 
 
 def fit_rectangles(obstacles: Obstacles, proposals: Proposals, config: DetectorConfig) -> Fits:
     """Rectangles of all clusters at all rotations, and the points that they were fitted to."""
     settings = config.box
     outline = _hull_points if settings.fit_to == "hull" else _slab_points
-    points, count = outline(obstacles, proposals, config)
+    points, count, hull_vertices = outline(obstacles, proposals, config)
     curve, extents = box.try_rotations(
         points,
         count,
@@ -46,12 +47,12 @@ def fit_rectangles(obstacles: Obstacles, proposals: Proposals, config: DetectorC
         num_angles=settings.num_angles,
         min_distance_m=settings.min_distance_m,
     )
-    return Fits(curve, extents, points, count)
+    return Fits(curve, extents, points, count, hull_vertices)
 
 
 def _hull_points(
     obstacles: Obstacles, proposals: Proposals, config: DetectorConfig
-) -> tuple[jax.Array, jax.Array]:
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The hull of each cluster, as the points that its rectangle is fitted to (the paper)."""
     num_obstacles = obstacles.xy.shape[0]
     index = hull.extreme_points(
@@ -63,7 +64,7 @@ def _hull_points(
     index = jnp.where(index < proposals.cluster.size, index % num_obstacles, num_obstacles)
     trace = functools.partial(trace_hulls, obstacles.xy, config.hull.max_vertices)
     vertices, count = map_rows(trace, index, num_rows=proposals.num_clusters, chunk=HULL_CHUNK)
-    return vertices, jnp.minimum(count, config.hull.max_vertices)
+    return vertices, jnp.minimum(count, config.hull.max_vertices), jnp.max(count)
 
 
 def trace_hulls(xy: jax.Array, max_vertices: int, index: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -74,7 +75,7 @@ def trace_hulls(xy: jax.Array, max_vertices: int, index: jax.Array) -> tuple[jax
 
 def _slab_points(
     obstacles: Obstacles, proposals: Proposals, config: DetectorConfig
-) -> tuple[jax.Array, jax.Array]:
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The points of each cluster between the slab's heights, or all where those are few."""
     num_clusters, num_obstacles = proposals.num_points.shape[0], obstacles.row.shape[0]
     rows, clusters = [], []
@@ -86,7 +87,7 @@ def _slab_points(
         jnp.concatenate(clusters), num_clusters=num_clusters, max_points=config.box.max_points
     )
     row = take(jnp.concatenate(rows), index, num_obstacles)
-    return take(obstacles.xy, row), count
+    return take(obstacles.xy, row), count, jnp.int32(0)
 
 
 def max_slab_points(capacity: int, config: DetectorConfig) -> int:
@@ -122,7 +123,7 @@ def _scene_preference(
     """The direction that the first map's boxes, fitted without a preference, vote for."""
     settings = config.box
     size = proposals.maps[0].num_points.shape[0]
-    first = jax.tree.map(lambda a: a[:size], fits)
+    first = jax.tree.map(lambda a: a[:size] if a.ndim else a, fits)
     j = jnp.arange(size)
     trials = Trials(
         jnp.where(j < proposals.num_first, j, size), jnp.zeros(size, jnp.int32), proposals.num_first
@@ -163,7 +164,7 @@ def _complete(
             return completion.keep_measured(rectangle, **{name: prior[name] for name in limits})
         if settings.mode == "away":
             return completion.extend_away(rectangle, **prior)
-        assert seen is not None, 'completion.mode="evidence" needs evidence.enabled'
+        assert seen is not None  # see check_settings
         hypotheses = completion.box_hypotheses(rectangle, **prior)
         rays = _cast_chunk(hypotheses, settings.num_rays, seen, config)
         inside, near = completion.point_agreement(

@@ -14,6 +14,26 @@ def stage_options(config: Any, *drop: str) -> dict[str, Any]:
     return {f.name: getattr(config, f.name) for f in dataclasses.fields(config) if f.name not in drop}
 
 
+def check_settings(config: DetectorConfig) -> None:
+    """Refuses settings that contradict each other.
+
+    Raises:
+      ValueError: naming the fields and the mend.
+    """
+    if config.completion.mode != "evidence":
+        return
+    if not config.evidence.enabled:
+        raise ValueError(
+            'completion.mode is "evidence" but evidence.enabled is False; '
+            'enable the evidence, or set completion.mode to "away" or "none".'
+        )
+    if config.box.criterion not in ("closeness", "visible_closeness"):
+        raise ValueError(
+            f'completion.mode "evidence" weighs closeness, but box.criterion is {config.box.criterion!r}; '
+            'choose a closeness criterion, or set completion.mode to "away" or "none".'
+        )
+
+
 def class_values(config: DetectorConfig, field: str, label: jax.Array) -> jax.Array:
     """A field of the class priors, for each label."""
     return jnp.stack([jnp.asarray(getattr(c, field), jnp.float32) for c in config.vehicles.classes])[label]

@@ -81,12 +81,12 @@ def score_boxes(
     flat = jnp.concatenate([rectangle[:, :2], jnp.zeros_like(rectangle[:, :1])], axis=1)
     bottom = above - height_above_ground(flat, heights.planes, heights.surface, config)
     total = jnp.where(chosen < score.shape[0], take(score, chosen) * late, 0)
-    order, final = _best(total, settings.max_candidates, settings.min_score)
+    order, _ = _best(total, settings.max_candidates, settings.min_score)
     unsorted = Candidates(
         rectangle, bottom, height, total, label, cluster, total > settings.min_score, jnp.zeros_like(label)
     )
     ordered = jax.tree.map(lambda a: take(a, order), unsorted)
-    return dataclasses.replace(ordered, num=jnp.maximum(num, final))
+    return dataclasses.replace(ordered, num=num)
 
 
 def _early_score(

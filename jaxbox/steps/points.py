@@ -22,7 +22,7 @@ class Sweep:
     """The sweep's points: which are finite, in the region, and no outliers."""
 
     xyz: jax.Array  # (N, 3) m, zero where not valid
-    num_points: jax.Array  # () rows that are no padding, as far as they fit
+    num_points: jax.Array  # () of the source sweep, which may exceed N
     present: jax.Array  # (N,) no padding
     finite: jax.Array  # (N,) and finite
     valid: jax.Array  # (N,) and in the region

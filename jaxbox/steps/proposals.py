@@ -85,9 +85,10 @@ def _list_proposals(maps: tuple[Clusters, ...], obstacles: Obstacles, config: De
         return joined
 
     max_height = join("max_height")
-    min_height = join("min_height")
+    min_height, num_points = join("min_height"), join("num_points")
     settings = config.vehicles
     is_large = (max_height > settings.large_height_m) & (min_height < settings.large_clearance_m)
+    is_large = is_large & (num_points >= settings.large_min_points)
     large, num_large = compact(is_large, settings.max_large)
     fitted = _fitted(cluster, obstacles, total, config)
     num_slab = jnp.max(jnp.sum(fitted, axis=1))
@@ -96,7 +97,7 @@ def _list_proposals(maps: tuple[Clusters, ...], obstacles: Obstacles, config: De
         cluster,
         sum(kept, jnp.int32(0)),
         kept[0],
-        join("num_points"),
+        num_points,
         min_height,
         max_height,
         fitted,
