@@ -157,8 +157,8 @@ def map_rows(function: Callable[[Any], Any], rows: Any, *, num_rows: jax.Array, 
         return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, i * chunk, chunk), padded)
 
     def step(i: jax.Array, out: Any) -> Any:
-        update = lambda o, n: jax.lax.dynamic_update_slice_in_dim(o, n, i * chunk, 0)  # noqa: E731
-        return jax.tree.map(update, out, function(part(i)))
+        new = function(part(i))
+        return jax.tree.map(lambda o, n: jax.lax.dynamic_update_slice_in_dim(o, n, i * chunk, 0), out, new)
 
     shapes = jax.eval_shape(function, jax.eval_shape(part, 0))
     size = capacity + -capacity % chunk
