@@ -74,7 +74,7 @@ def test_the_paper_preset_is_the_papers():
     assert (paper.box.criterion, paper.box.fit_to) == ("area", "hull")
     assert (paper.completion.mode, paper.evidence.enabled) == ("none", False)
     assert paper.clustering.adaptive_growth == 0
-    assert [m.num_levels for m in paper.clustering.maps] == [8]
+    assert [m.num_levels for m in paper.clustering.maps] == [13]
 
 
 def proposed(config):
