@@ -1,35 +1,17 @@
 """Matching, rates and the report of a folder, on frames worked by hand."""
 
-import dataclasses
 import json
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from kitti_objects import car
 
 from jaxbox import evaluation, geometry
 from jaxbox.evaluation import matching, report
 from jaxbox.io import InputError, KittiObject, open_sweeps, write_bin, write_labels
 
 ALL = matching.Selection()
-
-
-def car(right=0.0, forward=20.0, *, score=None, **changes) -> KittiObject:
-    left = 600 + 40 * right
-    item = KittiObject(
-        type="Car",
-        truncation=0.0,
-        occlusion=0,
-        alpha=0.0,
-        box_px=np.array([left, 170.0, left + 100, 230.0]),
-        height=1.5,
-        width=1.6,
-        length=3.9,
-        location=np.array([right, 1.7, forward]),
-        rotation_y=0.0,
-        score=score,
-    )
-    return dataclasses.replace(item, **changes)
 
 
 def dont_care(left, top, right, bottom) -> KittiObject:
