@@ -8,18 +8,17 @@ one, so a difference between two settings is judged by their mean beside their s
 """
 
 import argparse
-import dataclasses
+import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import common
-from jaxbox import Calibration, Detections, DetectorConfig
-from jaxbox.evaluation import Selection, count_points_in_boxes, kitti, report
-from jaxbox.geometry import wrap_yaw
-from jaxbox.io import KittiObject, Sweep, boxes_from_objects, objects_from_detections, open_sweeps
+from jaxbox import DetectorConfig
+from jaxbox.evaluation import Selection, kitti, report
+from jaxbox.evaluation.copies import COPIES, Copy, Frame, detect_copy, label_points, read_frame
+from jaxbox.io import KittiObject, open_sweeps, read_drives
 
 METRICS = ("bev", "3d")
 RECALLS = (("bev", 0.5), ("bev", 0.7), ("3d", 0.7))
@@ -28,88 +27,12 @@ WELL_SEEN_POINTS = 50
 """Cars with so many points must not have their axes swapped."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Copy:
-    """A sweep turned about the sensor, mirrored before where said."""
-
-    turn_deg: float = 0.0
-    mirrored: bool = False
-
-    @property
-    def name(self) -> str:
-        """Such as "+7.3" or "mirrored -13.9"."""
-        if not self.turn_deg and not self.mirrored:
-            return "as recorded"
-        return f"{'mirrored ' if self.mirrored else ''}{self.turn_deg:+g}"
-
-
-COPIES = (
-    Copy(), Copy(7.3), Copy(-13.9, mirrored=True), Copy(29.4), Copy(-21.7, mirrored=True), Copy(45.1),
-)  # fmt: skip
-"""Turns that no grid or angle step of the detector divides."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Frame:
-    """One labelled sweep, read once."""
-
-    name: str
-    xyz: np.ndarray
-    intensity: np.ndarray
-    calibration: Calibration
-    labels: list[KittiObject]
-
-
-def read_frame(sweep: Sweep) -> Frame | None:
-    labels, calibration = sweep.read_labels(), sweep.read_calibration()
-    if labels is None or calibration is None:
-        return None
-    return Frame(sweep.name, *sweep.read_points(), calibration, labels)
-
-
-def turn_points(xyz: np.ndarray, copy: Copy) -> np.ndarray:
-    """Points (n, 3) as the copy has them: mirrored left to right, then turned."""
-    mirror = np.array([1.0, -1.0 if copy.mirrored else 1.0, 1.0])
-    return ((xyz * mirror) @ _rotation(copy.turn_deg).T).astype(np.float32)
-
-
-def turn_back(detections: Detections, copy: Copy) -> Detections:
-    """Boxes of a copy as they stand in the recorded sweep."""
-    center = np.asarray(detections.center, np.float64) @ _rotation(copy.turn_deg)
-    yaw = np.asarray(detections.yaw, np.float64) - np.radians(copy.turn_deg)
-    if copy.mirrored:
-        center, yaw = center * [1, -1, 1], -yaw
-    return dataclasses.replace(
-        detections,
-        center=jnp.asarray(center, jnp.float32),
-        yaw=wrap_yaw(jnp.asarray(yaw, jnp.float32)),
-    )
-
-
-def _rotation(turn_deg: float) -> np.ndarray:
-    cos, sin = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
-    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
-
-
-def detect_copy(
+def detect_frames(
     frames: Sequence[Frame], copy: Copy, config: DetectorConfig
 ) -> tuple[dict[str, list[KittiObject]], list[int]]:
     """KITTI results and status bits of every frame of a copy."""
-    results, statuses = {}, []
-    for frame in frames:
-        found = common.detect(turn_points(frame.xyz, copy), frame.intensity, config)
-        results[frame.name] = objects_from_detections(turn_back(found, copy), frame.calibration)
-        statuses.append(int(found.status))
-    return results, statuses
-
-
-def label_points(frame: Frame) -> np.ndarray:
-    """(labels,) LiDAR points within each label's box, -1 for regions without one."""
-    boxed = [not label.is_dont_care for label in frame.labels]
-    counts = np.full(len(boxed), -1)
-    objects = [label for label in frame.labels if not label.is_dont_care]
-    counts[boxed] = count_points_in_boxes(frame.xyz, *boxes_from_objects(objects, frame.calibration))
-    return counts
+    found = {frame.name: detect_copy(frame, copy, config) for frame in frames}
+    return {name: objects for name, (objects, _) in found.items()}, [int(bits) for _, bits in found.values()]
 
 
 def measure(
@@ -153,6 +76,33 @@ def summarise(by_copy: Mapping[str, Mapping[str, Any]]) -> dict[str, dict[str, f
     }
 
 
+def measure_drives(
+    labels: kitti.Objects, results: kitti.Objects, drives: Mapping[str, str]
+) -> dict[str, dict[str, float]]:
+    """Average precision, its ceiling and SOFT of each drive by itself, of one copy."""
+    evaluation = kitti.evaluate(labels, results, min_overlap=MIN_OVERLAP, metrics=METRICS, drives=drives)
+    rows = {}
+    for drive, curves in evaluation.by_drive.items():
+        names = [name for name in labels if drives[name] == drive]
+        moderate = [curve for curve in curves if curve.difficulty == "moderate"]
+        rows[drive] = {
+            "frames": len(names),
+            "labels": moderate[0].num_labels,
+            **{f"{curve.metric} moderate": curve.r40 for curve in moderate},
+            "ceiling": moderate[0].to_dict()["ceiling_r40"],
+            "SOFT": kitti.soft_score({n: labels[n] for n in names}, {n: results[n] for n in names}),
+        }
+    return rows
+
+
+def mean_rows(tables: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, dict[str, float]]:
+    """The mean over copies of each cell."""
+    return {
+        drive: {key: float(np.mean([table[drive][key] for table in tables])) for key in row}
+        for drive, row in tables[0].items()
+    }
+
+
 def print_report(
     by_copy: Mapping[str, Mapping[str, Any]], summary: Mapping[str, Mapping[str, float]]
 ) -> None:
@@ -176,21 +126,34 @@ def print_report(
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = common.parser(__doc__ or "")
     parser.add_argument("--copies", type=int, default=len(COPIES), choices=range(1, len(COPIES) + 1))
+    parser.add_argument(
+        "--drives", type=pathlib.Path, metavar="FILE", help='a table by drive too; one "frame drive" a line'
+    )
     options: argparse.Namespace = parser.parse_args(arguments)
     config = common.chosen_config(options)
     sweeps = open_sweeps(common.data_folder("kitti_object"))
     frames = [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
     labels = {frame.name: frame.labels for frame in frames}
     num_points = {frame.name: label_points(frame) for frame in frames}
-    by_copy, statuses = {}, []
+    drives = None if options.drives is None else read_drives(options.drives, labels)
+    by_copy, statuses, by_drive = {}, [], []
     for copy in COPIES[: options.copies]:
-        results, bits = detect_copy(frames, copy, config)
+        results, bits = detect_frames(frames, copy, config)
         by_copy[copy.name] = measure(labels, results, num_points)
         statuses += bits
+        if drives is not None:
+            by_drive.append(measure_drives(labels, results, drives))
     summary = summarise(by_copy)
     print_report(by_copy, summary)
+    found: dict[str, Any] = {"num_frames": len(frames), "copies": by_copy, "summary": summary}
+    if by_drive:
+        found["by_drive"] = rows = mean_rows(by_drive)
+        print(
+            "\nby drive, mean over the copies (with few labels even perfect answers stay below 100: ceiling)"
+        )
+        columns = list(next(iter(rows.values())))
+        common.print_table(["drive", *columns], [[drive, *row.values()] for drive, row in rows.items()])
     print(f"\n{len(frames)} frames; status: {', '.join(common.status_names(statuses)) or 'OK'}")
-    found = {"num_frames": len(frames), "copies": by_copy, "summary": summary}
     common.write_report(found | {"status": common.status_names(statuses)}, options)
 
 

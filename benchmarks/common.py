@@ -1,8 +1,6 @@
 """What the benchmarks share: where the data is, which settings, what a report says of its circumstances."""
 
 import argparse
-import ast
-import dataclasses
 import importlib.metadata
 import json
 import os
@@ -19,6 +17,7 @@ import jaxbox
 from jaxbox import Detections, DetectorConfig, PointCloud, Status
 from jaxbox.cli.cache import enable_cache
 from jaxbox.io import atomic_writer
+from jaxbox.settings import parse_change, replace_settings
 
 PROJECT = pathlib.Path(__file__).resolve().parents[1]
 
@@ -54,50 +53,11 @@ def parser(description: str) -> argparse.ArgumentParser:
 def chosen_config(options: argparse.Namespace) -> DetectorConfig:
     """The preset with its changes; also switches the compilation cache on."""
     enable_cache()
-    config = DetectorConfig.presets()[options.preset]
-    for change in options.set:
-        config = override(config, change)
-    return config
-
-
-def override(config: DetectorConfig, change: str) -> DetectorConfig:
-    """Changes one setting.
-
-    Args:
-      config: the settings.
-      change: ``field=value``; the field is a dotted path, with numbers into tuples, the value a Python
-        literal, or else a word.
-
-    Returns:
-      The changed settings.
-
-    Raises:
-      SystemExit: naming the path, where there is no such setting.
-
-    >>> override(DetectorConfig(), "clustering.maps.1.cell_m=0.3").clustering.maps[1].cell_m
-    0.3
-    """
-    path, separator, text = change.partition("=")
-    if not separator:
-        raise SystemExit(f"--set {change}: write it as FIELD=VALUE.")
     try:
-        value = ast.literal_eval(text)
-    except (ValueError, SyntaxError):
-        value = text
-    try:
-        return _replaced(config, path.split("."), value)
-    except (AttributeError, IndexError, TypeError, ValueError) as error:
-        raise SystemExit(f"--set {change}: there is no setting {path}; see jaxbox/config.py.") from error
-
-
-def _replaced(node: Any, path: Sequence[str], value: Any) -> Any:
-    if not path:
-        return value
-    step, rest = path[0], path[1:]
-    if isinstance(node, tuple):
-        index = int(step)
-        return (*node[:index], _replaced(node[index], rest, value), *node[index + 1 :])
-    return dataclasses.replace(node, **{step: _replaced(getattr(node, step), rest, value)})
+        changes = dict(parse_change(change) for change in options.set)
+        return replace_settings(DetectorConfig.presets()[options.preset], changes)
+    except ValueError as error:
+        raise SystemExit(f"--set: {error}") from error
 
 
 def detect(xyz: np.ndarray, intensity: np.ndarray | None, config: DetectorConfig) -> Detections:

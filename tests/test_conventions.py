@@ -16,7 +16,7 @@ ROOT = pathlib.Path(jaxbox.__file__).parent
 PROJECT = ROOT.parent
 
 # Each layer may import those before it; the stages, the middle layer, never each other.
-FOUNDATION = {"version", "types", "capacities", "config", "masked", "geometry"}
+FOUNDATION = {"version", "types", "capacities", "config", "settings", "masked", "geometry"}
 STAGES = {
     "filtering", "ground", "clustering", "hull", "box", "descriptors", "evidence", "completion", "vehicles",
     "projection",

@@ -2,6 +2,7 @@
 
 from jaxbox.io._files import InputError, atomic_path, atomic_writer
 from jaxbox.io.argoverse2 import read_argoverse2_boxes, read_argoverse2_ground, read_argoverse2_points
+from jaxbox.io.drives import read_drives
 from jaxbox.io.images import read_image
 from jaxbox.io.jsonl import detections_record, read_jsonl, write_jsonl
 from jaxbox.io.kitti import (
@@ -36,6 +37,7 @@ __all__ = [
     "read_argoverse2_points",
     "read_bin",
     "read_calibration",
+    "read_drives",
     "read_image",
     "read_jsonl",
     "read_label_folder",
