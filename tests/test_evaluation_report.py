@@ -139,6 +139,28 @@ def test_recall_bins_share_out_the_labels():
     assert sum(row.num_labels for row in matching.recall_by_points(unknown)) == 0
 
 
+def test_a_verdict_marks_each_label_and_detection_once_and_keeps_their_rows():
+    labels = [car(type="Pedestrian"), car(), car(right=10.0), car(right=20.0, type="Van")]
+    results = [
+        car(right=-10.0, score=0.9),
+        car(type="Van", score=0.8),
+        car(right=20.0, score=0.7),
+        car(right=0.1, score=0.6),
+        car(right=-20.0, score=0.5, box_px=np.array([0.0, 0, 50, 20])),
+    ]
+    (scene,) = matching.select({"a": labels}, {"a": results}, ALL)
+    verdict = matching.judge(scene, metric="bev", min_overlap=0.5)
+    assert scene.label_rows.tolist() == [1, 2, 3], "the pedestrian is no matter of cars"
+    assert scene.detection_rows.tolist() == [0, 2, 3, 4]
+    assert verdict.found.tolist() == [True, False, False]
+    assert verdict.missed.tolist() == [False, True, False]
+    assert verdict.false.tolist() == [True, False, False, False]
+    assert scene.detection_rows[verdict.partner[verdict.found]].tolist() == [3]
+    (kept,) = matching.cut([scene], min_score=0.65)
+    assert kept.detection_rows.tolist() == [0, 2]
+    assert matching.judge(kept, metric="bev", min_overlap=0.5).missed.tolist() == [True, True, False]
+
+
 def test_points_on_a_face_are_inside_and_nan_is_nowhere():
     box = (np.array([[10.0, 5.0, 1.0]]), np.array([[4.0, 2.0, 2.0]]), np.array([np.pi / 2]))
     # The box is turned: 2 m along x, 4 m along y.
@@ -211,6 +233,23 @@ def test_nothing_found_and_nothing_labelled_give_none_and_are_json():
         assert matched["num"] == 0
         assert matched["mean_bev_iou"] is None
         assert "clear" not in measured["selections"]
+
+
+def test_false_alarms_are_told_a_frame_at_each_cut():
+    labels = {"a": [car()], "b": []}
+    results = {"a": [car(score=0.9), car(right=10.0, score=0.45)], "b": [car(score=0.25)]}
+    rates = evaluation.evaluate_objects(labels, results)["selections"]["all"]["rates_by_score"]
+    assert [rate["false_per_frame"] for rate in rates[:6]] == [1, 1, 1, 0.5, 0.5, 0]
+
+
+def test_cars_of_fifty_points_are_a_selection_with_their_own_axis_swaps():
+    labels = {"a": [car(), car(right=10.0)]}
+    results = {"a": [car(score=1.0, rotation_y=np.pi / 2), car(right=10.0, score=1.0, rotation_y=np.pi / 2)]}
+    measured = evaluation.evaluate_objects(labels, results, num_points={"a": np.array([49, 50])})
+    swaps = {
+        name: found["matched"]["yaw"]["num_axis_swaps"] for name, found in measured["selections"].items()
+    }
+    assert (swaps["all"], swaps["dense"]) == (2, 1)
 
 
 def test_a_detection_without_score_is_named():

@@ -75,6 +75,10 @@ class Scene:
     """(A, B) bird's-eye IoU."""
     box: np.ndarray
     """(A, B) 3D IoU."""
+    label_rows: np.ndarray
+    """(A,) int: rows of the labels in the frame's list."""
+    detection_rows: np.ndarray
+    """(B,) int: rows of the detections in the frame's list."""
 
 
 def select(
@@ -101,7 +105,8 @@ def select(
     """
     if num_points is None and selection.min_points > 0:
         raise ValueError("labels are selected by their LiDAR points, but no sweeps were given to count them.")
-    found = {name: _detections_of(results[name], selection.class_name, name) for name in labels}
+    found_rows = {name: _rows_of(results[name], selection.class_name, name) for name in labels}
+    found = {name: [results[name][row] for row in rows] for name, rows in found_rows.items()}
     boxes = {name: kitti.camera_boxes(items) for name, items in found.items()}
     scenes = []
     for name, objects in labels.items():
@@ -109,16 +114,18 @@ def select(
         points = np.full(len(objects), -1) if num_points is None else np.asarray(num_points[name], int)
         roles[(roles == _COUNTS) & (points >= 0) & (points < selection.min_points)] = _IGNORED
         rows = np.flatnonzero(roles != _OTHER)
-        scenes.append((name, kitti.camera_boxes(objects)[rows], roles[rows] == _COUNTS, points[rows]))
+        scenes.append((name, kitti.camera_boxes(objects)[rows], roles[rows] == _COUNTS, points[rows], rows))
     overlaps = framewise_overlaps([(scene[1], boxes[scene[0]]) for scene in scenes])
     return [
         Scene(
-            *scene,
+            *scene[:4],
             detections=boxes[scene[0]],
             scores=np.array([item.score for item in found[scene[0]]], float),
             excused=_excused(found[scene[0]], labels[scene[0]]),
             bev=bev,
             box=box,
+            label_rows=scene[4],
+            detection_rows=found_rows[scene[0]],
         )
         for scene, (bev, box) in zip(scenes, overlaps, strict=True)
     ]
@@ -143,11 +150,12 @@ def _label_role(label: KittiObject, selection: Selection) -> int:
     return int(kitti.label_roles([label], class_name, level)[0])
 
 
-def _detections_of(results: Sequence[KittiObject], class_name: str, frame: str) -> list[KittiObject]:
-    found = [item for item in results if item.type.lower() == class_name.lower()]
-    if any(item.score is None for item in found):
+def _rows_of(results: Sequence[KittiObject], class_name: str, frame: str) -> np.ndarray:
+    """Rows of the detections of a class."""
+    rows = [row for row, item in enumerate(results) if item.type.lower() == class_name.lower()]
+    if any(results[row].score is None for row in rows):
         raise ValueError(f"frame {frame} has a detection without score; results need 16 columns.")
-    return found
+    return np.array(rows, int)
 
 
 def _excused(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -> np.ndarray:
@@ -178,6 +186,7 @@ def _take_detections(scene: Scene, keep: np.ndarray) -> Scene:
         excused=scene.excused[keep],
         bev=scene.bev[:, keep],
         box=scene.box[:, keep],
+        detection_rows=scene.detection_rows[keep],
     )
 
 
@@ -205,6 +214,42 @@ def match(overlap: np.ndarray, counts: np.ndarray, *, min_overlap: float) -> np.
             matched[label] = detection
             open_pairs[label], open_pairs[:, detection] = 0, 0
     return matched
+
+
+@dataclasses.dataclass(frozen=True)
+class Verdict:
+    """What became of one frame's labels and detections; what is in no mask is neither right nor wrong."""
+
+    partner: np.ndarray
+    """(A,) int: detection of each label, also of ignored ones; -1 where it has none."""
+    found: np.ndarray
+    """(A,) bool: the label counts and has a detection."""
+    missed: np.ndarray
+    """(A,) bool: the label counts and has none."""
+    false: np.ndarray
+    """(B,) bool: the detection is of no label, and nothing excuses it."""
+
+
+def judge(scene: Scene, *, metric: str, min_overlap: float) -> Verdict:
+    """Says of each label whether it was found, and of each detection whether it is false.
+
+    Args:
+      scene: the frame.
+      metric: "bev" or "3d".
+      min_overlap: IoU that a match needs.
+
+    Returns:
+      The verdict.
+    """
+    partner = match(_overlap(scene, metric), scene.counts, min_overlap=min_overlap)
+    unmatched = np.ones(len(scene.detections), bool)
+    unmatched[partner[partner >= 0]] = False
+    return Verdict(
+        partner=partner,
+        found=scene.counts & (partner >= 0),
+        missed=scene.counts & (partner < 0),
+        false=unmatched & ~scene.excused,
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -237,9 +282,9 @@ def matched_boxes(scenes: Sequence[Scene], *, min_overlap: float) -> Matches:
     """
     frames, rows = [], []
     for scene in scenes:
-        matched = match(scene.bev, scene.counts, min_overlap=min_overlap)
-        for label in np.flatnonzero(scene.counts & (matched >= 0)):
-            found = matched[label]
+        verdict = judge(scene, metric="bev", min_overlap=min_overlap)
+        for label in np.flatnonzero(verdict.found):
+            found = verdict.partner[label]
             overlaps = scene.bev[label, found], scene.box[label, found]
             frames.append(scene.name)
             rows.append([*scene.labels[label], *scene.detections[found], *overlaps, scene.num_points[label]])
@@ -294,12 +339,9 @@ def rates(scenes: Sequence[Scene], *, metric: str, min_overlap: float) -> Rates:
     """
     num_labels = num_found = num_false = num_excused = 0
     for scene in scenes:
-        matched = match(_overlap(scene, metric), scene.counts, min_overlap=min_overlap)
-        found = int(np.sum(scene.counts & (matched >= 0)))
-        unmatched = np.ones(len(scene.detections), bool)
-        unmatched[matched[matched >= 0]] = False
-        false = int(np.sum(unmatched & ~scene.excused))
-        num_labels += int(np.sum(scene.counts))
+        verdict = judge(scene, metric=metric, min_overlap=min_overlap)
+        found, false = int(verdict.found.sum()), int(verdict.false.sum())
+        num_labels += int(scene.counts.sum())
         num_found += found
         num_false += false
         num_excused += len(scene.detections) - found - false

@@ -1,5 +1,6 @@
 """Everything that is measured of a folder of results, as one dictionary for JSON."""
 
+import dataclasses
 import os
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -15,8 +16,10 @@ SELECTIONS: Mapping[str, matching.Selection] = {
     "easy_to_hard": matching.Selection(difficulty="hard"),
     "easy_to_moderate": matching.Selection(difficulty="moderate"),
     "clear": matching.Selection(min_points=30, max_occlusion=1),
+    "dense": matching.Selection(min_points=50),
 }
-"""Cars: every label; those of KITTI's difficulties; and those that a sweep shows well."""
+"""Cars: every label; those of KITTI's difficulties; those that a sweep shows well; and those of so many
+points that no box should have its length and width changed places."""
 
 MATCH_OVERLAP = 0.2
 """Bird's-eye IoU from which sizes and directions are compared. A median car with its axes swapped still has
@@ -26,6 +29,51 @@ SCORE_CUTS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 """Scores at which recall and precision are reported."""
 
 _CUT_METRIC, _CUT_OVERLAP = "bev", 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class LabelledResults:
+    """A folder's labelled sweeps and the results for them."""
+
+    sweeps: tuple[Sweep, ...]
+    """Those with labels."""
+    labels: kitti.Objects
+    """Ground truth of each, by the sweep's name."""
+    results: kitti.Objects
+    """Detections of each."""
+    num_missing: int
+    """Result files that were missing and taken for empty."""
+
+
+def read_folders(
+    root: str | os.PathLike[str], results: str | os.PathLike[str], *, missing_as_empty: bool = False
+) -> LabelledResults:
+    """Reads the labels of a folder of sweeps and a folder of KITTI result files for them.
+
+    Args:
+      root: what `jaxbox.io.open_sweeps` takes; sweeps without labels are left out.
+      results: folder of ``NAME.txt`` or ``data/NAME.txt``, one a labelled sweep.
+      missing_as_empty: take a missing result file for an empty one.
+
+    Returns:
+      Sweeps, labels and results, in one order.
+
+    Raises:
+      InputError: for a missing folder, no labelled sweep, a missing result file, or a bad line.
+    """
+    labelled = [
+        (sweep, objects) for sweep in open_sweeps(root) if (objects := sweep.read_labels()) is not None
+    ]
+    if not labelled:
+        raise InputError(f"{root}: no sweep there has labels; expected label_2 or label_02 beside velodyne.")
+    labels = {sweep.name: objects for sweep, objects in labelled}
+    detections = _read_results(pathlib.Path(results), list(labels), missing_as_empty=missing_as_empty)
+    return LabelledResults(
+        sweeps=tuple(sweep for sweep, _ in labelled),
+        labels=labels,
+        results={name: found or [] for name, found in detections.items()},
+        num_missing=sum(found is None for found in detections.values()),
+    )
 
 
 def evaluate_folders(
@@ -40,7 +88,7 @@ def evaluate_folders(
     """Measures a folder of KITTI result files against the labels of a folder of sweeps.
 
     Args:
-      root: what `jaxbox.io.open_sweeps` takes; sweeps without labels are left out.
+      root: as `read_folders`, and so are the results.
       results: folder of ``NAME.txt`` or ``data/NAME.txt``, one a labelled sweep.
       selections: what counts, by name.
       match_overlap: bird's-eye IoU from which sizes and directions are compared.
@@ -51,27 +99,21 @@ def evaluate_folders(
       As `evaluate_objects`, and under "num_missing_results" how many files were taken for empty.
 
     Raises:
-      InputError: for a missing folder, no labelled sweep, a missing result file, or a bad line.
+      InputError: as `read_folders`.
     """
-    labelled = [
-        (sweep, objects) for sweep in open_sweeps(root) if (objects := sweep.read_labels()) is not None
-    ]
-    if not labelled:
-        raise InputError(f"{root}: no sweep there has labels; expected label_2 or label_02 beside velodyne.")
-    labels = {sweep.name: objects for sweep, objects in labelled}
-    detections = _read_results(pathlib.Path(results), list(labels), missing_as_empty=missing_as_empty)
-    counted = all(sweep.calibration_path is not None for sweep, _ in labelled)
+    read = read_folders(root, results, missing_as_empty=missing_as_empty)
+    counted = all(sweep.calibration_path is not None for sweep in read.sweeps)
     report = evaluate_objects(
-        labels,
-        {name: found or [] for name, found in detections.items()},
-        num_points={sweep.name: count_label_points(sweep, objects) for sweep, objects in labelled}
+        read.labels,
+        read.results,
+        num_points={sweep.name: count_label_points(sweep, read.labels[sweep.name]) for sweep in read.sweeps}
         if counted
         else None,
         selections=selections,
         match_overlap=match_overlap,
         drives=drives,
     )
-    return report | {"num_missing_results": sum(found is None for found in detections.values())}
+    return report | {"num_missing_results": read.num_missing}
 
 
 def _read_results(
@@ -193,7 +235,8 @@ def measure_selection(
       Numbers, strings, lists, dicts and None only:
         "selection": its fields;
         "rates": `Rates` at BEV and 3D IoU .5 and .7, of all detections;
-        "rates_by_score": `Rates` at BEV IoU .5 of the detections from each of `SCORE_CUTS` on;
+        "rates_by_score": `Rates` at BEV IoU .5 of the detections from each of `SCORE_CUTS` on, and
+          "false_per_frame" (None without frames);
         "by_range", "by_points": `RecallBin`, of all detections;
         "matched": number, mean IoU, yaw and size errors, and "constant_sizes", the errors of always
           answering the median car for the same labels (None for other classes);
@@ -222,7 +265,8 @@ def measure_selection(
 def _rates_at(scenes: Sequence[matching.Scene], min_score: float) -> dict[str, Any]:
     kept = matching.cut(scenes, min_score=min_score)
     at_cut = matching.rates(kept, metric=_CUT_METRIC, min_overlap=_CUT_OVERLAP)
-    return {"min_score": min_score} | at_cut.to_dict()
+    per_frame = at_cut.num_false / len(scenes) if scenes else None
+    return {"min_score": min_score} | at_cut.to_dict() | {"false_per_frame": per_frame}
 
 
 def _matched_errors(matches: matching.Matches, class_name: str, match_overlap: float) -> dict[str, Any]:
