@@ -139,6 +139,34 @@ def test_eval_says_which_result_is_missing_and_can_take_it_for_empty(kitti_folde
     assert "1 without results" in taken.stdout
 
 
+def test_eval_with_drives_has_a_row_a_drive(kitti_folder, detected, tmp_path):
+    drives = tmp_path / "drives.txt"
+    drives.write_text("000000 first_street\n000001 second_street\n")
+    arguments = ("eval", "--labels", kitti_folder, "--results", detected[0], "--drives", drives)
+    result = run(*arguments, "--json", tmp_path / "eval.json")
+    assert result.exit_code == 0, result.output
+    rows = [line for line in result.stdout.splitlines() if "_street" in line]
+    assert len(rows) == 2
+    report = json.loads((tmp_path / "eval.json").read_text())
+    assert report["num_drives"] == 2
+    assert list(report["kitti"]["by_drive"]) == ["first_street", "second_street"]
+    drives.write_text("000000 first_street\n")
+    missing = run(*arguments)
+    assert missing.exit_code == 2
+    assert "the first is 000001" in missing.stderr
+
+
+def test_changed_settings_reach_the_detector_and_the_last_change_holds(kitti_folder, tmp_path):
+    settings = tmp_path / "best.json"
+    settings.write_text(json.dumps({"vehicles.min_score": 0.9999, "vehicles.ring_weight": 8.5}))
+    sweep = kitti_folder / "velodyne" / "000000.bin"
+    common = ("detect", sweep, "--no-pictures", "--quiet", "--settings", settings)
+    assert run(*common, "--output", tmp_path / "a").exit_code == 0
+    assert run(*common, "--output", tmp_path / "b", "--set", "vehicles.min_score=0.001").exit_code == 0
+    assert read_labels(tmp_path / "a" / "000000.txt") == []
+    assert len(read_labels(tmp_path / "b" / "000000.txt")) > 0
+
+
 def test_one_broken_sweep_is_reported_and_the_others_are_done(kitti_folder, tmp_path):
     root = tmp_path / "training"
     shutil.copytree(kitti_folder, root)
@@ -210,6 +238,12 @@ def test_an_empty_sweep_is_no_failure_and_its_status_is_in_words(tmp_path):
         (("detect", "{tmp}", "--output", "{tmp}/out", "--min-score", "2"), "min-score"),
         (("detect", "{tmp}", "--output", "{tmp}/out", "--capacity", "0"), "capacity"),
         (("detect", "{tmp}"), "output"),
+        (("detect", "{tmp}", "--output", "{tmp}/out", "--set", "box.angles=9"), "nearest are box."),
+        (("detect", "{tmp}", "--output", "{tmp}/out", "--settings", "{tmp}/no.json"), "no.json"),
+        (
+            ("detect", "{tmp}", "--output", "{tmp}/out", "--set", "evidence.enabled=False"),
+            "enable the evidence",
+        ),
         (("eval", "--labels", "{tmp}/nowhere", "--results", "{tmp}"), "nowhere"),
         (("unknown",), "unknown"),
     ],

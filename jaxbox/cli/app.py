@@ -11,9 +11,21 @@ from jaxbox.cli.demo import run_demo
 from jaxbox.cli.detect import DetectOptions, ResultFormat, run_detect
 from jaxbox.cli.evaluate import run_eval
 from jaxbox.cli.info import print_info
-from jaxbox.config import DetectorConfig
-from jaxbox.io import InputError
+from jaxbox.cli.settings import chosen_config
 from jaxbox.version import __version__
+
+PresetOption = Annotated[str, typer.Option(help="Settings: default, or paper for the paper's choices.")]
+SettingsOption = Annotated[
+    pathlib.Path | None,
+    typer.Option(help="JSON file of changed settings by name, such as best.json of `tune`."),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="FIELD=VALUE", help="Change one setting by its name; repeatable."),
+]
+DrivesOption = Annotated[
+    pathlib.Path | None, typer.Option(help='Text file of the drive of each frame: "frame drive" a line.')
+]
 
 EXIT_CODES = (
     "Exit codes: 0 all went well; 1 some sweeps failed, the others are done; "
@@ -69,9 +81,9 @@ def detect(
     ],
     *,
     output: Annotated[pathlib.Path, typer.Option(help="Folder for results and pictures.")],
-    preset: Annotated[
-        str, typer.Option(help="Settings: default, or paper for the paper's choices.")
-    ] = "default",
+    preset: PresetOption = "default",
+    settings: SettingsOption = None,
+    changes: SetOption = None,
     result_format: Annotated[
         ResultFormat, typer.Option("--format", help="KITTI text files, one JSON Lines file, or both.")
     ] = ResultFormat.KITTI,
@@ -92,12 +104,9 @@ def detect(
     OUTPUT/pictures/NAME_*.png. A broken sweep is reported and the others go on.
     """
     with input_errors():
-        if preset not in DetectorConfig.presets():
-            names = ", ".join(DetectorConfig.presets())
-            raise InputError(f"--preset {preset}: there is no such preset; choose one of {names}.")
         options = DetectOptions(
             output=output,
-            preset=preset,
+            config=chosen_config(preset, settings, changes or []),
             result_format=result_format,
             capacity=capacity,
             min_score=min_score,
@@ -117,6 +126,7 @@ def evaluate(
         pathlib.Path | None,
         typer.Option(help="Folder for the plots (the plots extra); RESULTS/plots unless given."),
     ] = None,
+    drives: DrivesOption = None,
     missing_as_empty: Annotated[
         bool, typer.Option("--missing-as-empty", help="Take a missing result file for one without boxes.")
     ] = False,
@@ -124,7 +134,13 @@ def evaluate(
     """Score results against labels: the paper's size errors, recall and precision, KITTI's AP."""
     with input_errors():
         run_eval(
-            labels, results, missing_as_empty=missing_as_empty, json_path=json, plots=plots, console=stdout()
+            labels,
+            results,
+            missing_as_empty=missing_as_empty,
+            json_path=json,
+            plots=plots,
+            drives_path=drives,
+            console=stdout(),
         )
 
 

@@ -44,8 +44,8 @@ class DetectOptions:
 
     output: pathlib.Path
     """Folder for results and pictures."""
-    preset: str
-    """Name of the detector's settings."""
+    config: DetectorConfig
+    """The detector's settings."""
     result_format: ResultFormat
     """What to write."""
     capacity: int | None
@@ -73,7 +73,7 @@ def run_detect(path: pathlib.Path, options: DetectOptions) -> ExitCode:
     """
     sweeps = io.open_sweeps(path)
     options.output.mkdir(parents=True, exist_ok=True)
-    detector = TimedDetector(DetectorConfig.presets()[options.preset])
+    detector = TimedDetector(options.config)
     run = RunReport()
     try:
         with make_progress(shown=not options.quiet) as progress:

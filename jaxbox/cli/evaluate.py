@@ -12,7 +12,7 @@ from rich.table import Table
 from jaxbox import viz
 from jaxbox.cli.report import make_table
 from jaxbox.evaluation import evaluate_folders
-from jaxbox.io import atomic_writer
+from jaxbox.io import atomic_writer, open_sweeps, read_drives
 
 SELECTION_NAMES = {
     "all": "every labelled car",
@@ -36,6 +36,7 @@ def run_eval(
     missing_as_empty: bool,
     json_path: pathlib.Path | None,
     plots: pathlib.Path | None,
+    drives_path: pathlib.Path | None,
     console: Console,
 ) -> None:
     """Measures results against labels, prints the tables, and writes what is asked for.
@@ -46,13 +47,15 @@ def run_eval(
       missing_as_empty: take a missing result file for an empty one.
       json_path: file for every figure, or None.
       plots: folder for the plots; None for ``plots`` in the results' folder, if matplotlib is there.
+      drives_path: file with the drive of each frame, or None.
       console: where the tables go.
 
     Raises:
       InputError: where labels or results cannot be used.
       ImportError: without matplotlib, where a folder for the plots is given.
     """
-    report = evaluate_folders(labels, results, missing_as_empty=missing_as_empty)
+    drives = None if drives_path is None else read_drives(drives_path, _labelled_names(labels))
+    report = evaluate_folders(labels, results, drives=drives, missing_as_empty=missing_as_empty)
     print_report(report, console)
     if json_path is not None:
         with atomic_writer(json_path) as handle:
@@ -85,6 +88,12 @@ def print_report(report: Mapping[str, Any], console: Console) -> None:
         f"{yaw['num_axis_swaps']} axis swaps"
     )
     console.print(precision_table(report["kitti"]["curves"]))
+    if report["kitti"]["by_drive"]:
+        console.print(drive_table(report["kitti"]["by_drive"]))
+
+
+def _labelled_names(labels: pathlib.Path) -> list[str]:
+    return [sweep.name for sweep in open_sweeps(labels) if sweep.labels_path is not None]
 
 
 def recall_table(selections: Mapping[str, Any]) -> Table:
@@ -138,6 +147,17 @@ def precision_table(curves: Iterable[Mapping[str, Any]]) -> Table:
     return make_table(
         "KITTI average precision (R40) of its ceiling on these sweeps", ["", *difficulties], rows
     )
+
+
+def drive_table(by_drive: Mapping[str, Iterable[Mapping[str, Any]]]) -> Table:
+    """Average precision of cars of each drive by itself, moderate; few labels have a low ceiling."""
+    rows = []
+    for drive, curves in by_drive.items():
+        cars = {c["metric"]: c for c in curves if c["class"] == "Car" and c["difficulty"] == "moderate"}
+        cells = [f"{cars[name]['r40']:.2f} of {cars[name]['ceiling_r40']:.2f}" for name in ("bev", "3d")]
+        rows.append([drive, str(cars["3d"]["num_labels"]), *cells])
+    title = "cars by drive, moderate: average precision (R40) of its ceiling"
+    return make_table(title, ["drive", "labels", METRIC_NAMES["bev"], METRIC_NAMES["3d"]], rows)
 
 
 def write_plots(objects: Mapping[str, Any], folder: pathlib.Path) -> list[pathlib.Path]:
