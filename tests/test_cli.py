@@ -14,9 +14,10 @@ from typer.testing import CliRunner
 
 import jaxbox
 from jaxbox import synthetic
-from jaxbox.cli import app, cache, demo
+from jaxbox.cli import app, cache, demo, eval_pictures
 from jaxbox.cli.report import FrameReport, RunReport, describe_frame, describe_run
 from jaxbox.config import DetectorConfig
+from jaxbox.evaluation.report import read_folders
 from jaxbox.io import objects_from_detections, read_image, read_jsonl, read_labels, write_bin, write_labels
 from jaxbox.types import PointCloud, Status
 
@@ -121,9 +122,56 @@ def test_eval_of_results_against_themselves_finds_every_car(kitti_folder, detect
     assert cars["rates"][0]["num_labels"] > 0
     assert [rate["recall"] for rate in cars["rates"]] == [1.0] * 4
     assert cars["matched"]["sizes"]["pooled"]["mae"] == pytest.approx(0, abs=1e-6)
+    for text in ("by range, m", "by LiDAR points", "axis swaps", "at least 50 points", "a frame"):
+        assert text in result.stdout
     for text in ("constant: pooled", "Pearson", "1D IoU", "3D 0.7", "R40"):
         assert text in result.stdout
     assert sorted(path.name for path in (tmp_path / "plots").iterdir()) == ["dimensions.png", "residuals.png"]
+
+
+def test_eval_draws_each_frame_and_one_contact_sheet(kitti_folder, detected, tmp_path):
+    shutil.copytree(detected[0], tmp_path / "results", ignore=shutil.ignore_patterns("pictures"))
+    result = run("eval", "--labels", kitti_folder, "--results", tmp_path / "results", "--pictures")
+    assert result.exit_code == 0, result.output
+    folder = tmp_path / "results" / "pictures"
+    names = ["000000_eval.png", "000001_eval.png", "contact_sheet.png"]
+    assert sorted(path.name for path in folder.iterdir()) == names
+    sheet, tile = (read_image(folder / name) for name in ("contact_sheet.png", "000000_eval.png"))
+    assert sheet.shape[1] > 2 * eval_pictures.TILE_WIDTH_PX
+    assert tile.shape[0] > tile.shape[1] / 2, "the view from above alone: there is no image"
+
+
+def test_eval_with_many_frames_writes_several_sheets(kitti_folder, detected, tmp_path, monkeypatch):
+    monkeypatch.setattr(eval_pictures, "TILES_PER_SHEET", 1)
+    read = read_folders(kitti_folder, detected[0])
+    paths = eval_pictures.write_judged_pictures(read, tmp_path, min_score=0.2)
+    assert [path.name for path in paths] == ["contact_sheet_1.png", "contact_sheet_2.png"]
+
+
+def test_eval_pictures_with_a_broken_image_end_with_exit_code_2_and_its_file(
+    kitti_folder, detected, tmp_path
+):
+    root = tmp_path / "training"
+    shutil.copytree(kitti_folder, root)
+    (root / "image_2").mkdir()
+    (root / "image_2" / "000001.png").write_bytes(b"no image")
+    results = tmp_path / "results"
+    shutil.copytree(detected[0], results, ignore=shutil.ignore_patterns("pictures"))
+    result = run("eval", "--labels", root, "--results", results, "--pictures")
+    assert result.exit_code == 2
+    assert "image_2/000001.png: not a readable image" in result.stderr
+    assert not list(results.rglob("*.png"))
+
+
+def test_eval_without_a_calibration_measures_but_cannot_draw(kitti_folder, detected, tmp_path):
+    root = tmp_path / "training"
+    shutil.copytree(kitti_folder, root)
+    (root / "calib" / "000000.txt").unlink()
+    arguments = ("eval", "--labels", root, "--results", detected[0], "--plots", tmp_path / "plots")
+    assert run(*arguments).exit_code == 0
+    drawn = run(*arguments, "--pictures")
+    assert drawn.exit_code == 2
+    assert "000000.bin: no calibration belongs to it" in drawn.stderr
 
 
 def test_eval_says_which_result_is_missing_and_can_take_it_for_empty(kitti_folder, detected, tmp_path):

@@ -15,7 +15,7 @@ from jaxbox.viz.boxes import bird_eye_iou, find_matches
 from jaxbox.viz.colors import ESTIMATE, FALSE_ALARM, MISS, TRUTH
 from jaxbox.viz.perspective import NEAR_M, cut_segments, project, transform
 from jaxbox.viz.plots import DIMENSIONS
-from jaxbox.viz.verdict import choose_colors
+from jaxbox.viz.verdict import group_boxes
 
 CAR = (4.0, 1.8, 1.5)
 CAMERA = Calibration(
@@ -103,12 +103,13 @@ def test_box_outline_stays_within_a_line_width_of_its_footprint():
 def test_colors_tell_right_wrong_missed_and_unjudged(estimate_x, judged, expected):
     estimate, truth = one_box((estimate_x, 5.0, -1.0)), one_box()
     judged = None if judged is None else np.array(judged)
-    box_colors, truth_colors = choose_colors(estimate, truth, judged)
-    assert (box_colors[0], truth_colors[0]) == expected
+    groups = group_boxes(estimate, truth, judged)
+    assert [group.color for group in groups if len(group.boxes)] == list(expected)
 
 
 def test_without_truth_nothing_is_marked():
-    assert choose_colors(one_box(), None, None) == ([ESTIMATE], [])
+    (group,) = group_boxes(one_box(), None, None)
+    assert (group.color, len(group.boxes)) == (ESTIMATE, 1)
 
 
 def test_a_true_box_is_found_once_and_by_the_best():

@@ -11,6 +11,7 @@ from jaxbox.cli.demo import run_demo
 from jaxbox.cli.detect import DetectOptions, ResultFormat, run_detect
 from jaxbox.cli.evaluate import run_eval
 from jaxbox.cli.info import print_info
+from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.cli.settings import chosen_config
 from jaxbox.version import __version__
 
@@ -126,12 +127,22 @@ def evaluate(
         pathlib.Path | None,
         typer.Option(help="Folder for the plots (the plots extra); RESULTS/plots unless given."),
     ] = None,
+    pictures: Annotated[
+        bool, typer.Option("--pictures", help="Draw what was found, missed and false: RESULTS/pictures.")
+    ] = False,
+    min_score: Annotated[
+        float,
+        typer.Option(min=0.0, max=1.0, help="Draw no lower scores; the figures take all."),
+    ] = SHOWN_MIN_SCORE,
     drives: DrivesOption = None,
     missing_as_empty: Annotated[
         bool, typer.Option("--missing-as-empty", help="Take a missing result file for one without boxes.")
     ] = False,
 ) -> None:
-    """Score results against labels: the paper's size errors, recall and precision, KITTI's AP."""
+    """Score results against labels: the paper's size errors, recall and precision, KITTI's AP.
+
+    Pictures are RESULTS/pictures/NAME_eval.png and contact_sheet.png, all frames on one.
+    """
     with input_errors():
         run_eval(
             labels,
@@ -140,6 +151,8 @@ def evaluate(
             json_path=json,
             plots=plots,
             drives_path=drives,
+            pictures=pictures,
+            min_score=min_score,
             console=stdout(),
         )
 

@@ -10,8 +10,10 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxbox import viz
+from jaxbox.cli.eval_pictures import write_judged_pictures
 from jaxbox.cli.report import make_table
 from jaxbox.evaluation import evaluate_folders
+from jaxbox.evaluation.report import read_folders
 from jaxbox.io import atomic_writer, open_sweeps, read_drives
 
 SELECTION_NAMES = {
@@ -19,9 +21,10 @@ SELECTION_NAMES = {
     "easy_to_hard": "KITTI's easy to hard",
     "easy_to_moderate": "KITTI's easy and moderate",
     "clear": "at least 30 points, occlusion 0 or 1",
+    "dense": "at least 50 points",
 }
-PLOTS_FOLDER = "plots"
-"""Where in the results' folder the plots go, unless said otherwise."""
+PLOTS_FOLDER, PICTURES_FOLDER = "plots", "pictures"
+"""Where in the results' folder the plots go, unless said otherwise, and the pictures."""
 SIZE_SELECTION = "easy_to_hard"
 """The cars whose median the constant row answers."""
 CUT_OVERLAP = 0.5
@@ -37,6 +40,8 @@ def run_eval(
     json_path: pathlib.Path | None,
     plots: pathlib.Path | None,
     drives_path: pathlib.Path | None,
+    pictures: bool,
+    min_score: float,
     console: Console,
 ) -> None:
     """Measures results against labels, prints the tables, and writes what is asked for.
@@ -48,6 +53,8 @@ def run_eval(
       json_path: file for every figure, or None.
       plots: folder for the plots; None for ``plots`` in the results' folder, if matplotlib is there.
       drives_path: file with the drive of each frame, or None.
+      pictures: whether each frame is drawn, into ``pictures`` in the results' folder.
+      min_score: lower-scored boxes are left out of the pictures.
       console: where the tables go.
 
     Raises:
@@ -61,6 +68,10 @@ def run_eval(
         with atomic_writer(json_path) as handle:
             json.dump(report, handle, indent=1, allow_nan=False)
         console.print(f"wrote {json_path}", markup=False)
+    if pictures:
+        read = read_folders(labels, results, missing_as_empty=missing_as_empty)
+        for path in write_judged_pictures(read, results / PICTURES_FOLDER, min_score=min_score):
+            console.print(f"wrote {path}", markup=False)
     objects = report["selections"][SIZE_SELECTION]["objects"]
     try:
         paths = write_plots(objects, plots or results / PLOTS_FOLDER)
@@ -78,15 +89,12 @@ def print_report(report: Mapping[str, Any], console: Console) -> None:
     taken = report.get("num_missing_results", 0)
     console.print(f"{report['num_frames']} labelled sweeps" + f", {taken} without results" * bool(taken))
     console.print(recall_table(report["selections"]))
-    console.print(score_table(report["selections"]["all"]["rates_by_score"]))
-    matched = report["selections"][SIZE_SELECTION]["matched"]
-    console.print(size_table(matched))
-    yaw = matched["yaw"]
-    console.print(
-        f"mean BEV IoU {_number(matched['mean_bev_iou'])}, mean 3D IoU {_number(matched['mean_3d_iou'])}; "
-        f"yaw error median {_number(yaw['median_deg'], 1)}, p90 {_number(yaw['p90_deg'], 1)} degrees, "
-        f"{yaw['num_axis_swaps']} axis swaps"
-    )
+    everything = report["selections"]["all"]
+    console.print(score_table(everything["rates_by_score"]))
+    console.print(bin_table("range, m", everything["by_range"]))
+    console.print(bin_table("LiDAR points", everything["by_points"]))
+    console.print(size_table(report["selections"][SIZE_SELECTION]["matched"]))
+    console.print(pose_table(report["selections"]))
     console.print(precision_table(report["kitti"]["curves"]))
     if report["kitti"]["by_drive"]:
         console.print(drive_table(report["kitti"]["by_drive"]))
@@ -112,11 +120,29 @@ def score_table(rates_by_score: Iterable[Mapping[str, Any]]) -> Table:
     """Recall and precision over the least score, to choose where to cut."""
     keys = ("recall", "precision")
     rows = [
-        [f"{rate['min_score']:g}", *(_number(rate[key]) for key in keys), str(rate["num_false"])]
+        [
+            f"{rate['min_score']:g}",
+            *(_number(rate[key]) for key in keys),
+            str(rate["num_false"]),
+            _number(rate["false_per_frame"], 2),
+        ]
         for rate in rates_by_score
     ]
     title = f"every labelled car at BEV IoU {CUT_OVERLAP:g}, by least score"
-    return make_table(title, ["score from", *keys, "false alarms"], rows)
+    return make_table(title, ["score from", *keys, "false alarms", "a frame"], rows)
+
+
+def bin_table(name: str, bins: Iterable[Mapping[str, Any]]) -> Table:
+    """Recall over ranges of one value, such as distance or points."""
+    bins = list(bins)
+    rows = []
+    for row in bins:
+        upper = "" if row["upper"] is None else f" to {row['upper']:g}"
+        cells = [_number(value) for value in row["recall"].values()]
+        rows.append([f"from {row['lower']:g}{upper}", str(row["num_labels"]), *cells])
+    columns = [key.replace("_", " ").upper() for key in (bins[0]["recall"] if bins else {})]
+    title = f"recall of every labelled car by {name}, whatever the score"
+    return make_table(title, [name, "labels", *columns], rows)
 
 
 def size_table(matched: Mapping[str, Any]) -> Table:
@@ -127,6 +153,27 @@ def size_table(matched: Mapping[str, Any]) -> Table:
     title = f"size of {matched['num']} matched cars (BEV IoU >= {matched['min_bev_iou']:g}), easy to hard"
     columns = ["dimension", "MAE m", "RMSE m", "bias m", "error %", "Pearson", "1D IoU"]
     return make_table(title, columns, rows)
+
+
+def pose_table(selections: Mapping[str, Any]) -> Table:
+    """Overlap and direction of the matched cars, one row a selection."""
+    rows = []
+    for name, measured in selections.items():
+        matched = measured["matched"]
+        yaw = matched["yaw"]
+        rows.append(
+            [
+                SELECTION_NAMES.get(name, name),
+                str(matched["num"]),
+                _number(matched["mean_bev_iou"]),
+                _number(matched["mean_3d_iou"]),
+                _number(yaw["median_deg"], 1),
+                _number(yaw["p90_deg"], 1),
+                str(yaw["num_axis_swaps"]),
+            ]
+        )
+    columns = ["cars", "matched", "BEV IoU", "3D IoU", "median", "p90", "axis swaps"]
+    return make_table("mean overlap and yaw error in degrees of matched cars", columns, rows)
 
 
 def _size_row(name: str, errors: Mapping[str, Any]) -> list[str]:

@@ -5,24 +5,31 @@ frame: x forward, y left, z up, metres.
 """
 
 from jaxbox.viz.bird_eye import BirdEyeFrame, draw_bird_eye
-from jaxbox.viz.boxes import BoxSet
+from jaxbox.viz.boxes import BoxGroup, BoxSet
 from jaxbox.viz.canvas import save_png
 from jaxbox.viz.colors import color_by_height, color_by_id
+from jaxbox.viz.contact_sheet import make_contact_sheet
 from jaxbox.viz.image_boxes import draw_image_boxes
+from jaxbox.viz.judged import JudgedFrame, draw_judged_frame, group_by_verdict
 from jaxbox.viz.lidar_view import LidarCamera, draw_lidar_view
 from jaxbox.viz.plots import plot_dimensions, plot_residuals, save_figure
 from jaxbox.viz.stages import draw_stages
 
 __all__ = [
     "BirdEyeFrame",
+    "BoxGroup",
     "BoxSet",
+    "JudgedFrame",
     "LidarCamera",
     "color_by_height",
     "color_by_id",
     "draw_bird_eye",
     "draw_image_boxes",
+    "draw_judged_frame",
     "draw_lidar_view",
     "draw_stages",
+    "group_by_verdict",
+    "make_contact_sheet",
     "plot_dimensions",
     "plot_residuals",
     "save_figure",

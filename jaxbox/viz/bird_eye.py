@@ -7,13 +7,14 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from jaxbox.viz.boxes import BoxSet
+from jaxbox.viz.boxes import BoxGroup, BoxSet
 from jaxbox.viz.canvas import SHIFT, blank, draw_legend, draw_points, draw_polygon, draw_text
-from jaxbox.viz.colors import FAINT, HULL, INK, Color, color_by_height
-from jaxbox.viz.verdict import choose_colors, legend_entries
+from jaxbox.viz.colors import FAINT, HULL, INK, color_by_height
+from jaxbox.viz.verdict import group_boxes, legend_entries
 
 RING_STEP_M = 10.0
 SCALE_BAR_M = 10.0
+CAPTION_SCALE, CAPTION_PX = 0.4, 8
 SENSOR_HEIGHT_M = 1.73
 """Height of the sensor on the KITTI car: colours without a ground plane are measured from there."""
 
@@ -57,14 +58,16 @@ def draw_bird_eye(
     boxes: BoxSet | None = None,
     truth: BoxSet | None = None,
     judged: np.ndarray | None = None,
+    groups: Sequence[BoxGroup] | None = None,
     hulls: Sequence[np.ndarray] = (),
     frame: BirdEyeFrame | None = None,
     title: str = "",
+    legend: bool = True,
 ) -> np.ndarray:
     """Draws a sweep from above with range rings, scale bar and legend.
 
     With truth, false alarms and missed boxes are marked by colour: see
-    `jaxbox.viz.verdict.choose_colors`.
+    `jaxbox.viz.verdict.group_boxes`.
 
     Args:
       xyz: (n, 3) real numbers, m, sensor frame; not finite points are left out.
@@ -72,9 +75,11 @@ def draw_bird_eye(
       boxes: estimates.
       truth: true boxes.
       judged: (K,) bool: estimates that the truth covers; None is all.
+      groups: boxes with colours of their own, drawn in this order, in place of the last three.
       hulls: polygons (h, 2), m, sensor frame.
       frame: the part of the world; None is 40 m behind to 60 m ahead.
       title: first line of the legend.
+      legend: whether the groups and directions are explained.
 
     Returns:
       (h, w, 3) uint8, red green blue.
@@ -91,34 +96,29 @@ def draw_bird_eye(
     draw_points(picture, frame.to_pixels(xyz[order]), colors[order])
     for hull in hulls:
         draw_polygon(picture, frame.to_pixels(np.asarray(hull, np.float64)), HULL, thickness_px=1)
-    entries = _draw_boxes(picture, frame, boxes, truth, judged)
+    if groups is None:
+        groups = group_boxes(boxes, truth, judged)
+    _draw_groups(picture, frame, groups)
+    entries = legend_entries(groups)
     if len(hulls):
         entries.append((f"convex hull ({len(hulls)})", HULL))
     _draw_sensor(picture, frame)
-    _draw_scale_bar(picture, frame)
-    draw_legend(picture, entries, title=title)
+    _draw_scale_bar(picture, frame, "; forward is right, left is up" if legend else "")
+    draw_legend(picture, entries if legend else [], title=title)
     return picture
 
 
-def _draw_boxes(
-    picture: np.ndarray,
-    frame: BirdEyeFrame,
-    boxes: BoxSet | None,
-    truth: BoxSet | None,
-    judged: np.ndarray | None,
-) -> list[tuple[str, Color]]:
-    boxes = boxes or BoxSet(center=np.zeros((0, 3)), size=np.zeros((0, 3)), yaw=np.zeros(0))
-    box_colors, truth_colors = choose_colors(boxes, truth, judged)
-    footprints = frame.to_pixels(boxes.footprints())
-    for corners, color in zip(footprints, box_colors, strict=True):
-        draw_polygon(picture, corners, color)
-    if truth is not None:
-        # On top and thin: a right estimate would hide it.
-        for corners, color in zip(frame.to_pixels(truth.footprints()), truth_colors, strict=True):
-            draw_polygon(picture, corners, color, thickness_px=1)
-    for corners, caption, color in zip(footprints, boxes.captions, box_colors, strict=False):
-        draw_text(picture, caption, (corners[:, 0].max() + 4, corners[:, 1].min()), color, scale=0.4)
-    return legend_entries(box_colors, truth_colors)
+def _draw_groups(picture: np.ndarray, frame: BirdEyeFrame, groups: Sequence[BoxGroup]) -> None:
+    """All outlines, then all captions on top of them."""
+    footprints = [frame.to_pixels(group.boxes.footprints()) for group in groups]
+    for group, outlines in zip(groups, footprints, strict=True):
+        for corners in outlines:
+            draw_polygon(picture, corners, group.color, thickness_px=group.thickness_px)
+    for group, outlines in zip(groups, footprints, strict=True):
+        for corners, caption in zip(outlines, group.boxes.captions, strict=False):
+            row = corners[:, 1].max() + CAPTION_PX if group.caption_below else corners[:, 1].min()
+            position = corners[:, 0].max() + 4, row
+            draw_text(picture, caption, position, group.color, scale=CAPTION_SCALE)
 
 
 def _draw_rings(picture: np.ndarray, frame: BirdEyeFrame) -> None:
@@ -142,11 +142,11 @@ def _draw_sensor(picture: np.ndarray, frame: BirdEyeFrame) -> None:
     draw_polygon(picture, frame.to_pixels(arrow), INK)
 
 
-def _draw_scale_bar(picture: np.ndarray, frame: BirdEyeFrame) -> None:
+def _draw_scale_bar(picture: np.ndarray, frame: BirdEyeFrame, note: str) -> None:
     height, _ = picture.shape[:2]
     length = SCALE_BAR_M * frame.px_per_m
     bar = np.array(
         [[16, height - 24], [16, height - 16], [16 + length, height - 16], [16 + length, height - 24]]
     )
     draw_polygon(picture, bar, INK, closed=False)
-    draw_text(picture, f"{SCALE_BAR_M:.0f} m; forward is right, left is up", (28 + length, height - 16))
+    draw_text(picture, f"{SCALE_BAR_M:.0f} m{note}", (28 + length, height - 16))

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from jaxbox.types import Detections, Label
+from jaxbox.viz.colors import Color
 
 MATCH_IOU = 0.5
 """An estimate with at least this bird's-eye view IoU to a true box has found it."""
@@ -77,6 +78,23 @@ class BoxSet:
             rank=score[keep],
         )
 
+    def take(self, rows: np.ndarray) -> "BoxSet":
+        """Some of the boxes: rows is (k,) int or (K,) bool.
+
+        >>> size = [[4, 2, 1]] * 2
+        >>> pair = BoxSet(center=[[1, 0, 0], [9, 0, 0]], size=size, yaw=[0, 0], captions=("a", "b"))
+        >>> pair.take(np.array([False, True])).captions
+        ('b',)
+        """
+        chosen = np.arange(len(self))[rows]
+        return BoxSet(
+            center=self.center[chosen],
+            size=self.size[chosen],
+            yaw=self.yaw[chosen],
+            captions=tuple(self.captions[row] for row in chosen) if self.captions else (),
+            rank=None if self.rank is None else np.asarray(self.rank)[chosen],
+        )
+
     def footprints(self) -> np.ndarray:
         """(K, 4, 2) float64, m: corners in the bird's-eye view, counter-clockwise from front left."""
         local = _SIGNS * self.size[:, None, :2] / 2
@@ -96,6 +114,22 @@ class BoxSet:
     def segments(self) -> np.ndarray:
         """(K, 12, 2, 3) float64, m: the edges."""
         return self.corners()[:, EDGES]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class BoxGroup:
+    """Boxes that mean the same and look the same."""
+
+    name: str
+    """What they are, for the legend."""
+    boxes: BoxSet
+    """The boxes."""
+    color: Color
+    """Red, green, blue."""
+    thickness_px: int = 2
+    """Width of their lines."""
+    caption_below: bool = False
+    """Whether captions stand below the boxes, where those of other boxes in the same place leave room."""
 
 
 def bird_eye_iou(boxes: BoxSet, others: BoxSet) -> np.ndarray:

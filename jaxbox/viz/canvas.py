@@ -92,6 +92,19 @@ def draw_legend(picture: np.ndarray, entries: Sequence[tuple[str, Color]], *, ti
         row += LINE_STEP_PX
 
 
+def draw_swatches(
+    picture: np.ndarray, entries: Sequence[tuple[str, Color]], *, title: str = "", row_px: int = 22
+) -> None:
+    """Draws a title and a legend on one line in place, its lower edge at a row."""
+    column = 16
+    draw_text(picture, title, (column, row_px), scale=0.6)
+    column += cv2.getTextSize(title, FONT, 0.6, 1)[0][0] + LINE_STEP_PX * bool(title)
+    for text, color in entries:
+        cv2.rectangle(picture, (column, row_px - 11), (column + 18, row_px - 1), color, -1)
+        draw_text(picture, text, (column + 26, row_px))
+        column += 26 + cv2.getTextSize(text, FONT, 0.5, 1)[0][0] + LINE_STEP_PX
+
+
 def save_png(path: str | os.PathLike[str], picture: np.ndarray) -> pathlib.Path:
     """Writes a picture as PNG, under a temporary name first.
 

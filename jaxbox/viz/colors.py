@@ -16,9 +16,15 @@ FALSE_ALARM: Color = (255, 70, 70)
 TRUTH: Color = (70, 225, 120)
 MISS: Color = (255, 90, 235)
 HULL: Color = (120, 215, 255)
+LOOSE: Color = (90, 190, 255)
+"""A box that found its vehicle but fits it badly."""
+IGNORED: Color = (158, 162, 170)
+"""What is neither right nor wrong."""
 
 LOW_M, HIGH_M = -0.3, 3.0
 """Heights above the ground that the colour scale spans: a little below the road to a van's roof."""
+
+_DARK, _SHADES = (52, 56, 64), 84
 
 PALETTE_SIZE = 512
 """Ids so far apart share a colour."""
@@ -46,6 +52,24 @@ def color_by_height(height: np.ndarray, *, low_m: float = LOW_M, high_m: float =
     level = (20 + level.astype(np.int64) * 215 // 255).astype(np.uint8)
     scale = cv2.applyColorMap(np.arange(256, dtype=np.uint8).reshape(-1, 1), cv2.COLORMAP_TURBO)
     return np.ascontiguousarray(scale[:, 0, ::-1])[level]
+
+
+def shade_by_height(height: np.ndarray, *, low_m: float = LOW_M, high_m: float = HIGH_M) -> np.ndarray:
+    """Greys for heights from dark (low) to light (high), for pictures whose colours mean something else.
+
+    Args:
+      height: (n,) real numbers, m.
+      low_m: height of the darkest grey, m.
+      high_m: height of the lightest grey, m.
+
+    Returns:
+      (n, 3) uint8.
+
+    >>> shade_by_height(np.array([-9.0, 9.0])).tolist()
+    [[52, 56, 64], [136, 140, 148]]
+    """
+    share = np.clip(np.nan_to_num((np.asarray(height, np.float64) - low_m) / (high_m - low_m)), 0.0, 1.0)
+    return (np.array(_DARK) + share[:, None] * _SHADES).astype(np.uint8)
 
 
 def color_by_id(ids: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ from jaxbox.viz.boxes import BoxSet
 from jaxbox.viz.canvas import blank, draw_legend, draw_points, draw_segments
 from jaxbox.viz.colors import FAINT, Color, color_by_height
 from jaxbox.viz.perspective import NEAR_M, cut_segments, project, transform
-from jaxbox.viz.verdict import choose_colors, legend_entries
+from jaxbox.viz.verdict import group_boxes, legend_entries
 
 RING_STEP_M = 10.0
 NUM_RINGS = 6
@@ -86,14 +86,11 @@ def draw_lidar_view(
     picture = blank(width_px=camera.width_px, height_px=camera.height_px)
     _draw_segments_3d(picture, _ring_segments(), camera, FAINT, thickness_px=1)
     _draw_points_3d(picture, xyz, colors, camera)
-    boxes = boxes or BoxSet(center=np.zeros((0, 3)), size=np.zeros((0, 3)), yaw=np.zeros(0))
-    box_colors, truth_colors = choose_colors(boxes, truth, judged)
-    for segments, color in zip(boxes.segments(), box_colors, strict=True):
-        _draw_segments_3d(picture, segments, camera, color, thickness_px=2)
-    if truth is not None:
-        for segments, color in zip(truth.segments(), truth_colors, strict=True):
-            _draw_segments_3d(picture, segments, camera, color, thickness_px=1)
-    draw_legend(picture, legend_entries(box_colors, truth_colors), title=title)
+    groups = group_boxes(boxes, truth, judged)
+    for group in groups:
+        for segments in group.boxes.segments():
+            _draw_segments_3d(picture, segments, camera, group.color, thickness_px=group.thickness_px)
+    draw_legend(picture, legend_entries(groups), title=title)
     return picture
 
 
