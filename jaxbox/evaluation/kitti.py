@@ -16,6 +16,7 @@ recall samples are those of Simonelli et al., "Disentangling Monocular 3D Object
 """
 
 import dataclasses
+import functools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -68,12 +69,12 @@ class PrecisionCurve:
     @property
     def r11(self) -> float:
         """Average precision over 11 samples from recall 0 on, in [0, 100]."""
-        return _average(self.precision, r11=True)
+        return average_precision(self.precision, r11=True)
 
     @property
     def r40(self) -> float:
         """Average precision over 40 samples without recall 0, in [0, 100]."""
-        return _average(self.precision, r11=False)
+        return average_precision(self.precision, r11=False)
 
     def to_dict(self) -> dict[str, Any]:
         """Numbers and strings only, for JSON."""
@@ -83,14 +84,23 @@ class PrecisionCurve:
             "difficulty": self.difficulty,
             "r11": self.r11,
             "r40": self.r40,
-            "ceiling_r11": _average(self.ceiling, r11=True),
-            "ceiling_r40": _average(self.ceiling, r11=False),
+            "ceiling_r11": average_precision(self.ceiling, r11=True),
+            "ceiling_r40": average_precision(self.ceiling, r11=False),
             "num_labels": self.num_labels,
             "precision": self.precision.tolist(),
         }
 
 
-def _average(precision: np.ndarray, *, r11: bool) -> float:
+def average_precision(precision: np.ndarray, *, r11: bool) -> float:
+    """Mean precision over recall samples.
+
+    Args:
+      precision: (41,) in [0, 1].
+      r11: over 11 samples from recall 0 on; else over the 40 samples without recall 0.
+
+    Returns:
+      In [0, 100].
+    """
     return 100 * float(np.mean(precision[::_R11_STEP] if r11 else precision[1:]))
 
 
@@ -160,16 +170,16 @@ def evaluate(
     unknown = sorted(set(metrics) - set(METRICS))
     if unknown:
         raise ValueError(f"metrics {unknown} are unknown; choose from {list(METRICS)}.")
-    frames = _build_frames(labels, results)
+    frames = prepare_frames(labels, results)
     groups = _by_drive(labels, frames, drives) if drives is not None else {}
     by_drive = {drive: _curves(groups[drive], min_overlap, metrics) for drive in sorted(groups)}
     return KittiEvaluation(len(frames), _curves(frames, min_overlap, metrics), by_drive)
 
 
 def _by_drive(
-    names: Iterable[str], frames: Sequence["_Frame"], drives: Mapping[str, str]
-) -> dict[str, list["_Frame"]]:
-    groups: dict[str, list[_Frame]] = {}
+    names: Iterable[str], frames: Sequence["PreparedFrame"], drives: Mapping[str, str]
+) -> dict[str, list["PreparedFrame"]]:
+    groups: dict[str, list[PreparedFrame]] = {}
     for name, frame in zip(names, frames, strict=True):
         if name not in drives:
             raise ValueError(f"frame {name} has no drive; add it to drives.")
@@ -193,7 +203,7 @@ def soft_score(labels: Objects, results: Objects, *, class_name: str = "Car") ->
     Raises:
       ValueError: as `evaluate`.
     """
-    frames = _build_frames(labels, results)
+    frames = prepare_frames(labels, results)
     curves = [_curves(frames, {class_name: overlap}, ("3d",)) for overlap in SOFT_OVERLAPS]
     return float(np.mean([curve.r40 for group in curves for curve in group if curve.difficulty != "easy"]))
 
@@ -250,19 +260,34 @@ def _detection_role(detection: KittiObject, class_name: str, level: int) -> int:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Frame:
+class PreparedFrame:
     """One frame, with the overlaps that every class, difficulty and threshold shares."""
 
     labels: Sequence[KittiObject]
+    """n of them."""
     detections: Sequence[KittiObject]
+    """m of them."""
     scores: np.ndarray
+    """(m,) float64."""
     overlaps: Mapping[str, np.ndarray]
-    """(labels, detections) of each metric."""
+    """(n, m) of each metric."""
     excused: np.ndarray
     """(detections,) largest fraction in the image within one DontCare region."""
 
 
-def _build_frames(labels: Objects, results: Objects) -> list[_Frame]:
+def prepare_frames(labels: Objects, results: Objects) -> list[PreparedFrame]:
+    """Works out what every class, difficulty and threshold shares.
+
+    Args:
+      labels: ground truth of each frame, by name.
+      results: detections, each with a score, of each of these frames.
+
+    Returns:
+      The frames, in the order of the labels.
+
+    Raises:
+      ValueError: for frames without results or detections without score.
+    """
     missing = sorted(set(labels) - set(results))
     if missing:
         raise ValueError(
@@ -279,13 +304,13 @@ def _build_frames(labels: Objects, results: Objects) -> list[_Frame]:
 
 def _build_frame(
     labels: Sequence[KittiObject], detections: Sequence[KittiObject], bev: np.ndarray, box: np.ndarray
-) -> _Frame:
+) -> PreparedFrame:
     image = image_iou(_image_boxes(labels), _image_boxes(detections))
     regions = _image_boxes([label for label in labels if label.is_dont_care])
     excused = image_fractions(_image_boxes(detections), regions).max(axis=1, initial=0)
     scores = np.array([item.score for item in detections], float)
     overlaps = {"image": image, "orientation": image, "bev": bev, "3d": box}
-    return _Frame(labels, detections, scores, overlaps, excused)
+    return PreparedFrame(labels, detections, scores, overlaps, excused)
 
 
 def _image_boxes(objects: Sequence[KittiObject]) -> np.ndarray:
@@ -293,7 +318,7 @@ def _image_boxes(objects: Sequence[KittiObject]) -> np.ndarray:
 
 
 def _curves(
-    frames: Sequence[_Frame], min_overlap: Mapping[str, float], metrics: Sequence[str]
+    frames: Sequence[PreparedFrame], min_overlap: Mapping[str, float], metrics: Sequence[str]
 ) -> tuple[PrecisionCurve, ...]:
     return tuple(
         _curve(frames, class_name, metric, level, overlap)
@@ -304,25 +329,38 @@ def _curves(
 
 
 def _curve(
-    frames: Sequence[_Frame], class_name: str, metric: str, level: int, min_overlap: float
+    frames: Sequence[PreparedFrame], class_name: str, metric: str, level: int, min_overlap: float
 ) -> PrecisionCurve:
-    """One precision curve: collects the thresholds, then counts right and wrong at each of them."""
-    rounds = [_Round.of(frame, class_name, metric, level, min_overlap) for frame in frames]
-    num_labels = sum(int(np.sum(r.label_roles == _COUNTS)) for r in rounds)
-    scores = np.concatenate([np.zeros(0), *(_matched_scores(r) for r in rounds)])
-    thresholds = _recall_thresholds(scores, num_labels)
+    rounds = [Round.of(frame, class_name, metric, level, min_overlap) for frame in frames]
+    in_turns = metric == "orientation"
+    precision = precision_of(rounds, orientation=in_turns)
+    if in_turns and any(d.alpha == _INVALID_ALPHA for f in frames for d in f.detections):
+        precision = np.zeros_like(precision)
+    num_labels = sum(r.num_labels for r in rounds)
+    ceiling = _pad(np.ones(len(_recall_thresholds(np.ones(num_labels), num_labels))))
+    return PrecisionCurve(class_name, metric, DIFFICULTIES[level], precision, num_labels, ceiling)
+
+
+def precision_of(rounds: Sequence["Round"], *, orientation: bool = False) -> np.ndarray:
+    """Precision over recall: collects the thresholds, then counts right and wrong at each of them.
+
+    Args:
+      rounds: the frames, of one class, metric, difficulty and overlap.
+      orientation: weigh each right detection by its orientation similarity.
+
+    Returns:
+      (41,) float64 in [0, 1], at recall 0, 1/40, ..., 1: the best from there on.
+    """
+    scores = np.concatenate([np.zeros(0), *(r.matched_scores for r in rounds)])
+    thresholds = _recall_thresholds(scores, sum(r.num_labels for r in rounds))
     counts = np.zeros((3, len(thresholds)))
     for r in rounds:
         counts += _count(r, thresholds)
     right, wrong, similarity = counts
-    gain = similarity if metric == "orientation" else right
-    if metric == "orientation" and any(d.alpha == _INVALID_ALPHA for f in frames for d in f.detections):
-        gain = np.zeros_like(gain)
     total = right + wrong
+    gain = similarity if orientation else right
     precision = _pad(np.divide(gain, total, out=np.zeros_like(total), where=total > 0))
-    best_onward = np.maximum.accumulate(precision[::-1])[::-1]
-    ceiling = _pad(np.ones(len(_recall_thresholds(np.ones(num_labels), num_labels))))
-    return PrecisionCurve(class_name, metric, DIFFICULTIES[level], best_onward, num_labels, ceiling)
+    return np.maximum.accumulate(precision[::-1])[::-1]
 
 
 def _pad(values: np.ndarray) -> np.ndarray:
@@ -330,12 +368,15 @@ def _pad(values: np.ndarray) -> np.ndarray:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Round:
+class Round:
     """One frame as one class, metric and difficulty sees it."""
 
     label_roles: np.ndarray
+    """(labels,) int, as `label_roles`."""
     detection_roles: np.ndarray
+    """(detections,) int, likewise."""
     scores: np.ndarray
+    """(detections,) float64."""
     overlap: np.ndarray
     """(labels, detections)."""
     candidate: np.ndarray
@@ -343,16 +384,29 @@ class _Round:
     excused: np.ndarray
     """(detections,) bool: covered by a DontCare region."""
     similarity: np.ndarray
-    """(labels, detections) orientation similarity, (1 + cos of the difference of alpha) / 2."""
+    """(labels, detections) orientation similarity, (1 + cos of the difference of alpha) / 2; 0 for the
+    metrics that do not look at it."""
+
+    @property
+    def num_labels(self) -> int:
+        """Labels that count."""
+        return int(np.sum(self.label_roles == _COUNTS))
+
+    @functools.cached_property
+    def matched_scores(self) -> np.ndarray:
+        """Scores of the right detections where each label takes its best-scored candidate."""
+        return _matched_scores(self)
 
     @classmethod
-    def of(cls, frame: _Frame, class_name: str, metric: str, level: int, min_overlap: float) -> "_Round":
+    def of(
+        cls, frame: PreparedFrame, class_name: str, metric: str, level: int, min_overlap: float
+    ) -> "Round":
+        """Takes of a frame what one class, metric, difficulty (0 to 2) and overlap looks at."""
         roles = label_roles(frame.labels, class_name, level)
         detection_roles = np.array([_detection_role(d, class_name, level) for d in frame.detections], int)
         overlap = frame.overlaps[metric]
         used = (roles != _OTHER)[:, None] & (detection_roles != _OTHER)
-        label_alpha = np.array([label.alpha for label in frame.labels], float)
-        alpha = np.array([detection.alpha for detection in frame.detections], float)
+        in_turns = metric == "orientation"
         in_image = metric in ("image", "orientation")
         return cls(
             label_roles=roles,
@@ -361,11 +415,17 @@ class _Round:
             overlap=overlap,
             candidate=(overlap > min_overlap) & used,
             excused=(frame.excused > min_overlap) & in_image,
-            similarity=(1 + np.cos(label_alpha[:, None] - alpha)) / 2,
+            similarity=_similarity(frame) if in_turns else np.broadcast_to(0.0, overlap.shape),
         )
 
 
-def _matched_scores(r: _Round) -> np.ndarray:
+def _similarity(frame: PreparedFrame) -> np.ndarray:
+    label_alpha = np.array([label.alpha for label in frame.labels], float)
+    alpha = np.array([detection.alpha for detection in frame.detections], float)
+    return (1 + np.cos(label_alpha[:, None] - alpha)) / 2
+
+
+def _matched_scores(r: Round) -> np.ndarray:
     """Scores of the true positives where each label, in order, takes its best-scored candidate."""
     free = np.ones(len(r.scores), bool)
     scores = []
@@ -394,7 +454,7 @@ def _recall_thresholds(scores: np.ndarray, num_labels: int) -> np.ndarray:
     return np.array(thresholds[:NUM_SAMPLES], float)
 
 
-def _count(r: _Round, thresholds: np.ndarray) -> np.ndarray:
+def _count(r: Round, thresholds: np.ndarray) -> np.ndarray:
     """Counts one frame at every threshold T: each label, in order, takes its best-overlapping candidate.
 
     Candidates of the class come before those that are ignored, of which the first is taken.
