@@ -18,7 +18,15 @@ from jaxbox.cli import app, cache, demo, eval_pictures
 from jaxbox.cli.report import FrameReport, RunReport, describe_frame, describe_run
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation.report import read_folders
-from jaxbox.io import objects_from_detections, read_image, read_jsonl, read_labels, write_bin, write_labels
+from jaxbox.io import (
+    objects_from_detections,
+    read_image,
+    read_jsonl,
+    read_labels,
+    write_bin,
+    write_calibration,
+    write_labels,
+)
 from jaxbox.types import PointCloud, Status
 
 # Few beams, so that all sweeps of this file share the smallest capacity and one compile.
@@ -37,16 +45,6 @@ def run(*arguments):
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
-def calibration_text(calibration):
-    """A KITTI calibration file whose rectification is the identity."""
-    rows = {
-        "P2": np.asarray(calibration.P_rect),
-        "R0_rect": np.eye(3),
-        "Tr_velo_to_cam": np.asarray(calibration.T_rect_velo)[:3],
-    }
-    return "".join(f"{key}: {' '.join(f'{v:.9e}' for v in value.ravel())}\n" for key, value in rows.items())
-
-
 def write_points(path, sweep):
     write_bin(path, sweep.xyz, sweep.intensity)
 
@@ -61,7 +59,7 @@ def kitti_folder(tmp_path_factory):
     for seed in range(2):
         sweep = make_small_sweep(seed)
         write_points(root / "velodyne" / f"{seed:06d}.bin", sweep)
-        (root / "calib" / f"{seed:06d}.txt").write_text(calibration_text(sweep.calibration))
+        write_calibration(root / "calib" / f"{seed:06d}.txt", sweep.calibration)
         cloud = PointCloud.from_numpy(sweep.xyz, sweep.intensity)
         assert cloud.capacity == CAPACITY
         objects = objects_from_detections(jaxbox.detect(cloud, DetectorConfig()), sweep.calibration)

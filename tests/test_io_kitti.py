@@ -184,6 +184,14 @@ def test_both_spellings_of_the_calibration_are_read(tmp_path, text):
     np.testing.assert_array_equal(calibration.image_size_px, [1224, 370])
 
 
+def test_a_written_calibration_reads_back(tmp_path):
+    camera = io.read_calibration(write(tmp_path / "c.txt", CALIB))
+    io.write_calibration(tmp_path / "new" / "c.txt", camera)
+    back = io.read_calibration(tmp_path / "new" / "c.txt")
+    np.testing.assert_allclose(back.P_rect, camera.P_rect, rtol=1e-7)
+    np.testing.assert_allclose(back.T_rect_velo, camera.T_rect_velo, atol=1e-7)
+
+
 def test_object_and_raw_calibration_of_one_frame_agree(data_root):
     """Object frame 001497 is frame 7 of the raw drive; its file has digits more, hence the tolerance."""
     ours = io.read_calibration(data_root / "kitti_object/training/calib/001497.txt")
@@ -271,6 +279,19 @@ def test_results_hold_only_valid_boxes_that_the_camera_sees(calibration):
     for item in touching:
         assert (item.box_px[:2] >= 0).all()
         assert (item.box_px[2:] <= [1241, 374]).all()
+
+
+def test_labels_of_boxes_say_how_much_the_image_shows_and_come_back(calibration):
+    center = np.array([[20.0, 0, -1], [-20, 0, -1], [12, 9.5, -1]])
+    size, yaw = np.array([[4.0, 1.6, 1.5]] * 3), np.array([0.3, 0.3, 0.3])
+    whole, behind, cut = io.objects_from_boxes(center, size, yaw, calibration, types=["Car", "Car", "Van"])
+    assert behind is None
+    assert (whole.type, whole.truncation, whole.occlusion, whole.score) == ("Car", 0, 0, None)
+    assert cut.type == "Van"
+    assert 0.1 < cut.truncation < 0.7
+    back = io.boxes_from_objects([whole, cut], calibration)
+    for found, expected in zip(back, (center, size, yaw), strict=True):
+        np.testing.assert_allclose(found, expected[[0, 2]], atol=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,13 @@ from jaxbox.io.jsonl import detections_record, read_jsonl, write_jsonl
 from jaxbox.io.kitti import (
     KittiObject,
     boxes_from_objects,
+    objects_from_boxes,
     objects_from_detections,
-    read_calibration,
     read_label_folder,
     read_labels,
-    read_raw_calibration,
     write_labels,
 )
+from jaxbox.io.kitti_calibration import read_calibration, read_raw_calibration, write_calibration
 from jaxbox.io.labelled import LabelledBoxes
 from jaxbox.io.pandaset import read_pandaset_boxes, read_pandaset_points
 from jaxbox.io.points import read_bin, read_points, read_text_points, write_bin
@@ -30,6 +30,7 @@ __all__ = [
     "atomic_writer",
     "boxes_from_objects",
     "detections_record",
+    "objects_from_boxes",
     "objects_from_detections",
     "open_sweeps",
     "read_argoverse2_boxes",
@@ -49,6 +50,7 @@ __all__ = [
     "read_semantic_labels",
     "read_text_points",
     "write_bin",
+    "write_calibration",
     "write_jsonl",
     "write_labels",
 ]

@@ -1,6 +1,7 @@
 """Files read with errors a user can act on, and written whole or not at all."""
 
 import contextlib
+import math
 import os
 import pathlib
 import tempfile
@@ -48,6 +49,29 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
         raise InputError(f"{path}: there is no such file; check the path.") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
+
+
+def finite_number(text: str, name: str, where: str) -> float:
+    """Reads a number.
+
+    Args:
+      text: the word.
+      name: the field, for the error.
+      where: file and line, for the error.
+
+    Returns:
+      A finite number.
+
+    Raises:
+      InputError: for anything else.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"{where}: {name} is {text!r}; it must be a finite number.")
+    return value
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""KITTI's files and conventions; nothing outside this module knows them.
+"""KITTI's labels and conventions; nothing outside this module and `kitti_calibration` knows them.
 
 KITTI describes a box in the rectified camera frame (x right, y down, z forward) by (h, w, l), the centre
 of its **bottom** face and ``rotation_y``, the angle of its length axis about the camera's y axis. The
@@ -15,11 +15,10 @@ import pathlib
 from collections.abc import Iterable, Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxbox.io._files import InputError, atomic_writer, read_text
-from jaxbox.projection import check_full_rank, compose_transforms, project_boxes, rigid_transform
+from jaxbox.io._files import InputError, atomic_writer, finite_number, read_text
+from jaxbox.projection import project_boxes
 from jaxbox.types import Calibration, Detections, Label
 
 # Columns of the object labels, in the order of the development kit's readme.
@@ -31,15 +30,6 @@ _OBJECT_COLUMNS = (15, 16)
 _TRACKING_COLUMNS = (17, 18)
 
 DONT_CARE = "DontCare"
-
-IMAGE_SIZE_PX = (1242, 375)
-"""Width and height of most rectified images, for sweeps that come without one."""
-
-CAMERA = 2
-"""The left colour camera, in whose image the object and tracking labels are."""
-
-RAW_CALIBRATION_FILES = ("calib_velo_to_cam.txt", "calib_cam_to_cam.txt")
-"""In a raw recording's folder of the day."""
 
 MIN_VISIBLE_FRACTION = 0.3
 """Boxes with less of their 2D box in the image are no answer: the labels hold what the image shows."""
@@ -116,7 +106,7 @@ def _parse_object(fields: list[str], where: str) -> KittiObject:
             f"{where}: {len(fields)} columns; KITTI labels have 15, results 16, tracking labels 17 and "
             "tracking results 18. Mend or remove the line."
         )
-    numbers = [_number(text, name, where) for text, name in zip(fields[1:], _FIELDS[1:], strict=False)]
+    numbers = [finite_number(text, name, where) for text, name in zip(fields[1:], _FIELDS[1:], strict=False)]
     return KittiObject(
         type=fields[0],
         truncation=numbers[0],
@@ -132,16 +122,6 @@ def _parse_object(fields: list[str], where: str) -> KittiObject:
         frame=frame,
         track_id=track_id,
     )
-
-
-def _number(text: str, name: str, where: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise InputError(f"{where}: {name} is {text!r}; it must be a finite number.")
-    return value
 
 
 def _integer(text: str, name: str, where: str) -> int:
@@ -228,108 +208,6 @@ def tracking_name(sequence: str, frame: int) -> str:
     return f"{sequence}_{frame:06d}"
 
 
-def read_calibration(
-    path: str | os.PathLike[str], *, camera: int = CAMERA, image_size_px: tuple[int, int] = IMAGE_SIZE_PX
-) -> Calibration:
-    """Reads an object or tracking ``calib/*.txt`` (the two spell two of the keys differently).
-
-    Args:
-      path: the file.
-      camera: 0 to 3, whose P matrix is taken.
-      image_size_px: width and height, which the file does not hold.
-
-    Returns:
-      The camera, with T_rect_velo = R0_rect Tr_velo_to_cam.
-
-    Raises:
-      InputError: naming file and key, where one is missing, has a wrong number of values or a value
-        that is no finite number, or a matrix is singular.
-    """
-    entries = _read_entries(path)
-    rectification = _matrix(entries, ("R0_rect", "R_rect"), (3, 3), path)
-    extrinsics = _matrix(entries, ("Tr_velo_to_cam", "Tr_velo_cam"), (3, 4), path)
-    projection = _matrix(entries, (f"P{camera}",), (3, 4), path)
-    return _calibration(projection, rectification, extrinsics, image_size_px, path)
-
-
-def read_raw_calibration(
-    folder: str | os.PathLike[str],
-    *,
-    camera: int = CAMERA,
-    image_size_px: tuple[int, int] | None = None,
-) -> Calibration:
-    """Reads a raw recording's ``calib_velo_to_cam.txt`` and ``calib_cam_to_cam.txt``.
-
-    Args:
-      folder: the day's folder, which holds both.
-      camera: 0 to 3.
-      image_size_px: width and height; None takes the file's ``S_rect``.
-
-    Returns:
-      The camera, with T_rect_velo = R_rect_00 T_velo_to_cam: all cameras are rectified to camera 0.
-
-    Raises:
-      InputError: as `read_calibration`.
-    """
-    velo_path, cam_path = (pathlib.Path(folder) / name for name in RAW_CALIBRATION_FILES)
-    velo, cam = _read_entries(velo_path), _read_entries(cam_path)
-    rotation = _matrix(velo, ("R",), (3, 3), velo_path)
-    translation = _matrix(velo, ("T",), (3, 1), velo_path)
-    rectification = _matrix(cam, ("R_rect_00",), (3, 3), cam_path)
-    projection = _matrix(cam, (f"P_rect_{camera:02d}",), (3, 4), cam_path)
-    if image_size_px is None:
-        width, height = _matrix(cam, (f"S_rect_{camera:02d}",), (2,), cam_path)
-        image_size_px = (int(width), int(height))
-    extrinsics = np.hstack([rotation, translation])
-    return _calibration(projection, rectification, extrinsics, image_size_px, folder)
-
-
-def _read_entries(path: str | os.PathLike[str]) -> dict[str, list[str]]:
-    """Words after each line's key; the tracking files write some keys without the colon."""
-    lines = (line.split() for line in read_text(path).splitlines())
-    return {words[0].rstrip(":"): words[1:] for words in lines if words}
-
-
-def _matrix(
-    entries: dict[str, list[str]],
-    spellings: tuple[str, ...],
-    shape: tuple[int, ...],
-    path: str | os.PathLike[str],
-) -> np.ndarray:
-    key = next((spelling for spelling in spellings if spelling in entries), None)
-    if key is None:
-        present = ", ".join(entries) or "nothing"
-        raise InputError(
-            f"{path}: no key {' or '.join(spellings)}; it holds {present}. Give KITTI's calibration file."
-        )
-    words = entries[key]
-    if len(words) != math.prod(shape):
-        raise InputError(f"{path}: {key} has {len(words)} values; it must have {math.prod(shape)}.")
-    return np.array([_number(word, key, str(path)) for word in words]).reshape(shape)
-
-
-def _calibration(
-    projection: np.ndarray,
-    rectification: np.ndarray,
-    extrinsics: np.ndarray,
-    image_size_px: tuple[int, int],
-    path: str | os.PathLike[str],
-) -> Calibration:
-    T_rect_cam = rigid_transform(jnp.asarray(rectification), jnp.zeros(3))
-    T_cam_velo = rigid_transform(jnp.asarray(extrinsics[:, :3]), jnp.asarray(extrinsics[:, 3]))
-    try:
-        check_full_rank(np.asarray(T_rect_cam), "the rectifying rotation")
-        check_full_rank(np.asarray(T_cam_velo), "the LiDAR-to-camera transform")
-        check_full_rank(projection[:, :3], "the camera matrix")
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from error
-    return Calibration(
-        P_rect=jnp.asarray(projection, jnp.float32),
-        T_rect_velo=compose_transforms(T_rect_cam, T_cam_velo),
-        image_size_px=jnp.asarray(image_size_px, jnp.int32),
-    )
-
-
 def objects_from_detections(
     detections: Detections,
     calibration: Calibration,
@@ -352,21 +230,54 @@ def objects_from_detections(
     Returns:
       One object a box, best score first.
     """
-    center, size, yaw = detections.center, detections.size, detections.yaw
+    keep = np.asarray(detections.valid) & (np.asarray(detections.score) >= min_score)
+    objects = objects_from_boxes(
+        np.asarray(detections.center),
+        np.asarray(detections.size),
+        np.asarray(detections.yaw),
+        calibration,
+        types=[Label(label).name.title() for label in np.asarray(detections.label).tolist()],
+        min_visible_fraction=min_visible_fraction,
+    )
+    return [
+        dataclasses.replace(item, truncation=-1.0, occlusion=-1, score=float(score))
+        for item, kept, score in zip(objects, keep, np.asarray(detections.score), strict=True)
+        if kept and item is not None
+    ]
+
+
+def objects_from_boxes(
+    center: np.ndarray,
+    size: np.ndarray,
+    yaw: np.ndarray,
+    calibration: Calibration,
+    *,
+    types: Sequence[str],
+    min_visible_fraction: float = MIN_VISIBLE_FRACTION,
+) -> list[KittiObject | None]:
+    """Turns boxes into KITTI labels, such as the truth of a sweep of another source.
+
+    Args:
+      center: (n, 3) m, sensor frame.
+      size: (n, 3) m: length, width, height.
+      yaw: (n,) rad.
+      calibration: the camera whose image the 2D boxes are in.
+      types: n class names.
+      min_visible_fraction: boxes with a smaller part of their 2D box in the image are no label.
+
+    Returns:
+      n objects, with the part out of the image as truncation and occlusion 0; None for no label.
+    """
     image = _project_boxes(center, size, yaw, calibration)
-    keep = np.array(detections.valid & image.visible)
-    keep &= np.asarray(detections.score) >= min_score
-    keep &= np.asarray(image.visible_fraction) >= min_visible_fraction
-    location, rotation_y = _kitti_pose(np.asarray(center), np.asarray(size), np.asarray(yaw), calibration)
-    rows = np.flatnonzero(keep)
+    fraction, boxes_px = np.asarray(image.visible_fraction), np.asarray(image.boxes_px, np.float64)
+    keep = np.asarray(image.visible) & (fraction >= min_visible_fraction)
+    location, rotation_y = _kitti_pose(center, size, yaw, calibration)
     length, width, height = np.asarray(size, np.float64).T
-    boxes_px, score = np.asarray(image.boxes_px, np.float64), np.asarray(detections.score)
-    label = np.asarray(detections.label)
     return [
         KittiObject(
-            type=Label(label[row]).name.title(),
-            truncation=-1.0,
-            occlusion=-1,
+            type=types[row],
+            truncation=1 - float(fraction[row]),
+            occlusion=0,
             alpha=observation_angle(rotation_y[row], location[row]),
             box_px=boxes_px[row],
             height=float(height[row]),
@@ -374,9 +285,10 @@ def objects_from_detections(
             length=float(length[row]),
             location=location[row],
             rotation_y=float(rotation_y[row]),
-            score=float(score[row]),
         )
-        for row in rows
+        if keep[row]
+        else None
+        for row in range(len(types))
     ]
 
 

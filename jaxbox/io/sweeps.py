@@ -21,14 +21,12 @@ import numpy as np
 
 from jaxbox.io._files import InputError
 from jaxbox.io.images import read_image
-from jaxbox.io.kitti import (
+from jaxbox.io.kitti import KittiObject, read_labels, tracking_name
+from jaxbox.io.kitti_calibration import (
     IMAGE_SIZE_PX,
     RAW_CALIBRATION_FILES,
-    KittiObject,
     read_calibration,
-    read_labels,
     read_raw_calibration,
-    tracking_name,
 )
 from jaxbox.io.points import POINT_SUFFIXES, TEXT_SUFFIXES, read_points
 from jaxbox.types import Calibration
