@@ -35,10 +35,11 @@ def data_folder(name: str) -> pathlib.Path:
     return root / name
 
 
-def parser(description: str) -> argparse.ArgumentParser:
-    """A parser with the options of every benchmark."""
+def parser(description: str, *, preset: bool = True) -> argparse.ArgumentParser:
+    """A parser with the options of every benchmark; without the preset's where the benchmark chooses it."""
     options = argparse.ArgumentParser(description=description)
-    options.add_argument("--preset", choices=sorted(DetectorConfig.presets()), default="default")
+    if preset:
+        options.add_argument("--preset", choices=sorted(DetectorConfig.presets()), default="default")
     options.add_argument(
         "--set",
         action="append",
@@ -50,12 +51,12 @@ def parser(description: str) -> argparse.ArgumentParser:
     return options
 
 
-def chosen_config(options: argparse.Namespace) -> DetectorConfig:
-    """The preset with its changes; also switches the compilation cache on."""
+def chosen_config(options: argparse.Namespace, *, preset: str | None = None) -> DetectorConfig:
+    """The preset, the user's unless named, with its changes; also switches the compilation cache on."""
     enable_cache()
     try:
         changes = dict(parse_change(change) for change in options.set)
-        return replace_settings(DetectorConfig.presets()[options.preset], changes)
+        return replace_settings(DetectorConfig.presets()[preset or options.preset], changes)
     except ValueError as error:
         raise SystemExit(f"--set: {error}") from error
 
