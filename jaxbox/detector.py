@@ -43,6 +43,11 @@ def detect(
     return _detect_jit(cloud, config, key)
 
 
+def count_compilations() -> int:
+    """How often `detect` has been compiled, or loaded from the cache, in this process."""
+    return _detect_jit._cache_size()  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
+
+
 def _as_float(threshold: Any) -> Any:
     # jit tells 8 from 8.0 and from a NumPy scalar, and would compile again for each.
     return threshold if isinstance(threshold, jax.Array) else float(threshold)

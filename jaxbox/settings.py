@@ -69,6 +69,20 @@ def replace_settings(config: DetectorConfig, changes: Mapping[str, Any]) -> Dete
     return config
 
 
+def changed_settings(config: DetectorConfig, base: DetectorConfig) -> dict[str, Any]:
+    """What to change in a base to get some settings, the inverse of `replace_settings`.
+
+    Args:
+      config: the settings.
+      base: of the same presets' structure, such as the preset that they came from.
+
+    Returns:
+      The values that differ, by dotted name.
+    """
+    values = {name: leaf.value for name, leaf in _leaves(base)}
+    return {name: leaf.value for name, leaf in _leaves(config) if leaf.value != values[name]}
+
+
 def parse_change(text: str) -> tuple[str, Any]:
     """Reads one ``FIELD=VALUE``.
 

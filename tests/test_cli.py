@@ -325,7 +325,7 @@ def test_eval_without_matplotlib_prints_its_tables_and_says_why_there_are_no_plo
     assert "no plots: plots need matplotlib: pip install 'jaxbox[plots]'" in result.stdout.replace("\n", " ")
 
 
-@pytest.mark.parametrize("command", ["demo", "detect", "eval", "info"])
+@pytest.mark.parametrize("command", ["demo", "detect", "eval", "info", "tune"])
 def test_every_help_states_the_exit_codes(command):
     result = run(command, "--help")
     assert result.exit_code == 0

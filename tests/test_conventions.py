@@ -29,13 +29,21 @@ ALLOWED = {
     "reference": {"version", "types", "config", "masked"},
     "synthetic": FOUNDATION | {"projection"},
     **dict.fromkeys(TOOLS, FOUNDATION | STAGES | WIRING | TOOLS),
+    "tuning": FOUNDATION | WIRING | TOOLS,
 }
 TOP = {"cli", "__main__", "__init__"}
 
 MODULES = sorted(
     name for _, name, _ in pkgutil.walk_packages([str(ROOT)], "jaxbox.") if not name.endswith("__main__")
 )
-PUBLIC_MODULES = ["jaxbox", "jaxbox.io", "jaxbox.evaluation", "jaxbox.viz", "jaxbox.synthetic"]
+PUBLIC_MODULES = [
+    "jaxbox",
+    "jaxbox.io",
+    "jaxbox.evaluation",
+    "jaxbox.tuning",
+    "jaxbox.viz",
+    "jaxbox.synthetic",
+]
 
 
 def source_files():

@@ -1,4 +1,4 @@
-"""The four commands and their options; the work is done in the module of each."""
+"""The five commands and their options; the work is done in the module of each."""
 
 import pathlib
 from typing import Annotated
@@ -13,6 +13,10 @@ from jaxbox.cli.evaluate import run_eval
 from jaxbox.cli.info import print_info
 from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.cli.settings import chosen_config
+from jaxbox.cli.tune import TuneOptions, run_tune
+from jaxbox.evaluation.copies import COPIES
+from jaxbox.evaluation.objectives import OBJECTIVES
+from jaxbox.io import InputError
 from jaxbox.version import __version__
 
 PresetOption = Annotated[str, typer.Option(help="Settings: default, or paper for the paper's choices.")]
@@ -155,6 +159,56 @@ def evaluate(
             min_score=min_score,
             console=stdout(),
         )
+
+
+@app.command(epilog=EXIT_CODES)
+def tune(
+    *,
+    labels: Annotated[pathlib.Path, typer.Option(help="A labelled KITTI folder.")],
+    output: Annotated[pathlib.Path, typer.Option(help="Folder for the report and the best settings.")],
+    search: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="FIELD=LOW:HIGH[:log]",
+            help="Range of one traced setting; repeatable. Without any, the main thresholds round the base.",
+        ),
+    ] = None,
+    trials: Annotated[int, typer.Option(min=1, help="Settings to try, the base among them.")] = 100,
+    refine: Annotated[
+        int, typer.Option(min=0, help="How many of them are steps round the best, chosen by all labels.")
+    ] = 0,
+    copies: Annotated[
+        int, typer.Option(min=1, max=len(COPIES), help="Turned and mirrored copies of each sweep.")
+    ] = 4,
+    objective: Annotated[str, typer.Option(help=f"One of {', '.join(OBJECTIVES)}; moderate R40.")] = "soft",
+    drives: DrivesOption = None,
+    preset: PresetOption = "default",
+    settings: SettingsOption = None,
+    changes: SetOption = None,
+    seed: Annotated[int, typer.Option(min=0, help="Another number tries other settings.")] = 0,
+) -> None:
+    """Search settings on labelled sweeps, and say what they are worth on drives left out.
+
+    Thresholds are traced: every trial runs in one compiled program. Each drive is scored with the setting
+    that the other drives chose. Interrupted, it reports what is done and ends with exit code 1. Use the
+    result with `jaxbox detect --settings OUTPUT/best.json`.
+    """
+    with input_errors():
+        if objective not in OBJECTIVES:
+            raise InputError(f"--objective {objective}: choose one of {', '.join(OBJECTIVES)}.")
+        options = TuneOptions(
+            output=output,
+            preset=preset,
+            config=chosen_config(preset, settings, changes or []),
+            search=search or [],
+            trials=trials,
+            refine=refine,
+            copies=copies,
+            objective=objective,
+            drives=drives,
+            seed=seed,
+        )
+        raise typer.Exit(run_tune(labels, options, stdout()))
 
 
 @app.command(epilog=EXIT_CODES)

@@ -1,0 +1,230 @@
+"""``jaxbox tune``: tries settings on labelled sweeps and says which hold on drives that were left out."""
+
+import csv
+import dataclasses
+import json
+import pathlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+from rich.console import Console
+
+from jaxbox import tuning
+from jaxbox.cli.console import ExitCode, make_progress, print_error
+from jaxbox.cli.report import make_table
+from jaxbox.config import DetectorConfig
+from jaxbox.detector import count_compilations
+from jaxbox.evaluation.copies import COPIES, Frame, read_frame
+from jaxbox.evaluation.objectives import OBJECTIVES
+from jaxbox.io import InputError, atomic_writer, open_sweeps, read_drives
+from jaxbox.settings import changed_settings
+from jaxbox.tuning import Axis, Bench, Trial
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TuneOptions:
+    """The options of ``jaxbox tune``; the command's help explains them."""
+
+    output: pathlib.Path
+    """Folder for the report."""
+    preset: str
+    """Name of the preset that the base comes from."""
+    config: DetectorConfig
+    """The base: the preset with its changes."""
+    search: Sequence[str]
+    """The ranges, or none for the default space."""
+    trials: int
+    """Settings that are tried, with the base."""
+    refine: int
+    """How many of them are steps round the best."""
+    copies: int
+    """Of `COPIES`, how many are scored."""
+    objective: str
+    """Name in `OBJECTIVES`."""
+    drives: pathlib.Path | None
+    """File with the drive of each frame."""
+    seed: int
+    """Of the settings that are tried."""
+
+
+def run_tune(labels: pathlib.Path, options: TuneOptions, console: Console) -> ExitCode:
+    """Tries settings, reports, and writes report.json, report.md, best.json and trials.csv.
+
+    Interrupted, it reports the trials that are done.
+
+    Args:
+      labels: folder of labelled sweeps.
+      options: the command's options.
+      console: where results go.
+
+    Returns:
+      `ExitCode.FRAME_FAILED` where it was interrupted.
+
+    Raises:
+      InputError: where labels or options cannot be used.
+    """
+    axes = chosen_axes(options)
+    bench = make_bench(labels, options)
+    options.output.mkdir(parents=True, exist_ok=True)
+    compiled_before = count_compilations()
+    console.print(f"compiling the detector for {bench.capacity} points")
+    compile_s = bench.warm_up()
+    trials: list[Trial] = []
+    interrupted = False
+    with make_progress(shown=True) as progress:
+        task = progress.add_task("tuning", total=options.trials * bench.sweeps_per_trial)
+        try:
+            for trial in try_settings(bench, axes, options, lambda: progress.advance(task)):
+                trials.append(trial)
+                write_trials(options.output / "trials.csv", bench, axes, trials)
+                best = tuning.best_trial(trials)
+                console.print(
+                    f"trial {trial.index} of {options.trials - 1}: {trial.mean:.2f}, {trial.seconds:.1f} s; "
+                    f"best {best.mean:.2f}, trial {best.index}"
+                )
+        except KeyboardInterrupt:
+            interrupted = True
+    if not trials:
+        print_error("interrupted before the base was scored; there is nothing to report.")
+        return ExitCode.FRAME_FAILED
+    report = tuning.make_report(bench, axes, trials) | {
+        "interrupted": interrupted,
+        "num_planned": options.trials,
+        "preset": options.preset,
+        "base_changes": changed_settings(options.config, DetectorConfig.presets()[options.preset]),
+        "drives": None if options.drives is None else options.drives.name,
+        "seed": options.seed,
+        "compile_s": compile_s,
+        "num_compilations": count_compilations() - compiled_before,
+    }
+    write_report(report, options, console)
+    return ExitCode.FRAME_FAILED if interrupted else ExitCode.OK
+
+
+def chosen_axes(options: TuneOptions) -> list[Axis]:
+    """The ranges that were asked for, or the default space.
+
+    Raises:
+      InputError: for a range that cannot be searched, or a setting that stands twice.
+    """
+    if not options.search:
+        return tuning.default_axes(options.config)
+    try:
+        axes = [tuning.parse_axis(options.config, text) for text in options.search]
+    except ValueError as error:
+        raise InputError(f"--search: {error}") from error
+    names = [axis.name for axis in axes]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise InputError(f"--search: {twice} stands there twice; give one range.")
+    return axes
+
+
+def make_bench(labels: pathlib.Path, options: TuneOptions) -> Bench:
+    """Reads the labelled sweeps, and what is left out together.
+
+    Raises:
+      InputError: where there are none, one cannot be read, or a frame has no drive.
+    """
+    frames = [frame for sweep in open_sweeps(labels) if (frame := read_frame(sweep)) is not None]
+    if not frames:
+        raise InputError(
+            f"{labels}: no sweep there has labels and a calibration; give a labelled KITTI folder."
+        )
+    return Bench(
+        base=options.config,
+        frames=frames,
+        groups=_groups(frames, options.drives),
+        copies=COPIES[: options.copies],
+        objective=OBJECTIVES[options.objective],
+    )
+
+
+def _groups(frames: Sequence[Frame], drives: pathlib.Path | None) -> dict[str, str]:
+    names = [frame.name for frame in frames]
+    return {name: name for name in names} if drives is None else read_drives(drives, names)
+
+
+def try_settings(
+    bench: Bench, axes: Sequence[Axis], options: TuneOptions, on_sweep: Callable[[], None]
+) -> Iterator[Trial]:
+    """The base, settings spread evenly over the space, then steps round the best of these.
+
+    Args:
+      bench: what they are tried on.
+      axes: the space.
+      options: how many of each, and the seed.
+      on_sweep: called after each sweep.
+
+    Yields:
+      Each trial as it is done.
+    """
+    best = bench.run(0, {}, blind=True, on_sweep=on_sweep)
+    yield best
+    refined = min(options.refine, options.trials - 1)
+    spread = tuning.latin_hypercube(axes, options.trials - 1 - refined, seed=options.seed)
+    for index, changes in enumerate(spread, 1):
+        trial = bench.run(index, changes, blind=True, on_sweep=on_sweep)
+        best = tuning.best_trial([best, trial])
+        yield trial
+    if not refined:
+        return
+    values = tuning.axis_values(bench.base, axes) | dict(best.changes)
+    steps = tuning.refine(axes, values, best.mean)
+    changes = next(steps)
+    for index in range(len(spread) + 1, options.trials):
+        trial = bench.run(index, changes, blind=False, on_sweep=on_sweep)
+        yield trial
+        try:
+            changes = steps.send(trial.mean)
+        except StopIteration:
+            return
+
+
+def write_trials(path: pathlib.Path, bench: Bench, axes: Sequence[Axis], trials: Sequence[Trial]) -> None:
+    """Writes a row a trial: its settings and scores, whole or not at all."""
+    base = tuning.axis_values(bench.base, axes)
+    with atomic_writer(path) as handle:
+        rows = csv.writer(handle, lineterminator="\n")
+        rows.writerow(["trial", "blind", "mean", *(copy.name for copy in bench.copies), *base, "status"])
+        for trial in trials:
+            values = (base | dict(trial.changes)).values()
+            status = " ".join(bit.name or "" for bit in type(trial.status) if bit and bit in trial.status)
+            rows.writerow([trial.index, trial.blind, trial.mean, *trial.scores, *values, status or "OK"])
+
+
+def write_report(report: dict[str, Any], options: TuneOptions, console: Console) -> None:
+    """Prints the report and writes it as JSON and Markdown, with the best settings beside it."""
+    notes = run_notes(report)
+    for name, columns, rows in tuning.report_tables(report):
+        console.print(make_table(name, columns, rows))
+    for line in [*notes, *tuning.report_sentences(report)]:
+        console.print(line, markup=False)
+    title = f"Settings tried on the {options.preset} preset"
+    texts = {
+        "report.json": json.dumps(report, indent=1, allow_nan=False),
+        "report.md": tuning.markdown_report(report, title=title, notes=notes),
+        "best.json": json.dumps(report["base_changes"] | report["best"]["changes"], indent=1),
+    }
+    for name, text in texts.items():
+        with atomic_writer(options.output / name) as handle:
+            handle.write(text)
+    console.print(f"wrote {', '.join(texts)} and trials.csv to {options.output}", markup=False)
+
+
+def run_notes(report: dict[str, Any]) -> list[str]:
+    """Sentences on how the search was run."""
+    done, planned = len(report["trials"]), report["num_planned"]
+    ended = "interrupted; " if report["interrupted"] else ""
+    groups = (
+        "No drives were given, so each sweep was left out by itself: sweeps of a drive resemble each other, "
+        "and the held-out figures are flattered."
+        if report["drives"] is None
+        else f"Groups are the drives of {report['drives']}."
+    )
+    return [
+        f"{done} of {planned} trials ({ended}seed {report['seed']}), "
+        f"median {report['seconds_per_trial']:.1f} s a trial.",
+        f"Compilations of the detector, all trials together: {report['num_compilations']}, "
+        f"{report['compile_s']:.1f} s before the first, for {report['capacity']} points.",
+        groups,
+    ]

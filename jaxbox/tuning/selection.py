@@ -1,0 +1,162 @@
+"""Which setting to take, and what taking it so is worth on drives that had no say in it.
+
+The best of many settings on the frames that chose it is flattered: some of its gain is luck. So for each
+drive the best setting on all other drives is taken, this drive's frames are scored with it, and all frames
+left out so are scored together.
+"""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Generic, TypeVar
+
+import numpy as np
+
+from jaxbox.types import Status
+
+Match = TypeVar("Match")
+"""What a score is made of, for one frame."""
+
+NOISE = 1.0
+"""Points of the objective that turning the sweeps alone can move; smaller gains are no evidence."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Trial(Generic[Match]):
+    """One setting and what it scored."""
+
+    index: int
+    """0 is the base."""
+    changes: Mapping[str, float]
+    """Thresholds that differ from the base, by dotted name."""
+    blind: bool
+    """Whether it was proposed without a look at any label; only such ones may stand for a drive left out."""
+    matches: Sequence[Mapping[str, Match]]
+    """For each copy, each frame."""
+    scores: tuple[float, ...]
+    """For each copy, over all frames."""
+    scores_without: Mapping[str, tuple[float, ...]]
+    """For each group, for each copy, over the frames of all other groups."""
+    status: Status = Status.OK
+    """Together of all sweeps."""
+    seconds: float = 0.0
+    """What it took."""
+
+    @property
+    def mean(self) -> float:
+        """Over the copies."""
+        return float(np.mean(self.scores))
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HeldOut:
+    """The honest figures."""
+
+    chosen: Mapping[str, int]
+    """For each group, the trial that all other groups chose."""
+    scores: tuple[float, ...]
+    """For each copy: all frames together, each with the setting that was chosen without it."""
+    base_scores: tuple[float, ...]
+    """For each copy, the base over all frames."""
+    group_scores: Mapping[str, tuple[float, float]]
+    """For each group by itself, mean over the copies: the base, and the setting chosen without it."""
+
+    @property
+    def times_chosen(self) -> dict[int, int]:
+        """How many groups chose each trial, most first."""
+        return dict(Counter(self.chosen.values()).most_common())
+
+    @property
+    def gain(self) -> float:
+        """Mean over the copies of what was won over the base."""
+        return float(np.mean(np.subtract(self.scores, self.base_scores)))
+
+    @property
+    def spread(self) -> float | None:
+        """Standard deviation of the gain over the copies; None for one copy."""
+        gains = np.subtract(self.scores, self.base_scores)
+        return float(np.std(gains, ddof=1)) if len(gains) > 1 else None
+
+    @property
+    def noise(self) -> float:
+        """The gain must exceed this: its spread, and at least `NOISE`."""
+        return max(NOISE, self.spread or 0.0)
+
+    @property
+    def keep_base(self) -> bool:
+        """Whether the gain is no more than noise."""
+        return self.gain <= self.noise
+
+
+def score_without(
+    matches: Sequence[Mapping[str, Match]],
+    groups: Mapping[str, str],
+    score: Callable[[Iterable[Match]], float],
+) -> dict[str, tuple[float, ...]]:
+    """Scores all frames but one group's, for each group.
+
+    Args:
+      matches: for each copy, each frame.
+      groups: the group of each frame.
+      score: of some frames.
+
+    Returns:
+      For each group, the score of each copy.
+    """
+    return {
+        left_out: tuple(score(m for name, m in copy.items() if groups[name] != left_out) for copy in matches)
+        for left_out in dict.fromkeys(groups.values())
+    }
+
+
+def best_trial(trials: Sequence[Trial[Match]]) -> Trial[Match]:
+    """The trial of the best mean over the copies; the first of equals, so that the base wins a draw."""
+    return max(trials, key=lambda trial: (trial.mean, -trial.index))
+
+
+def leave_one_out(
+    trials: Sequence[Trial[Match]],
+    groups: Mapping[str, str],
+    score: Callable[[Iterable[Match]], float],
+) -> HeldOut | None:
+    """Scores each group with the setting that the others chose.
+
+    Args:
+      trials: the base first; those that are not blind are not chosen from.
+      groups: the group of each frame.
+      score: of some frames, which may be of different settings.
+
+    Returns:
+      The held-out figures; None with fewer than two groups, as there is nothing left to choose by.
+    """
+    names = list(dict.fromkeys(groups.values()))
+    if len(names) < 2:
+        return None
+    blind = {trial.index: trial for trial in trials if trial.blind}
+    chosen = {
+        name: max(blind, key=lambda index: (np.mean(blind[index].scores_without[name]), -index))
+        for name in names
+    }
+    copies = range(len(trials[0].matches))
+    scores = tuple(
+        score(blind[chosen[group]].matches[copy][frame] for frame, group in groups.items()) for copy in copies
+    )
+    members = _members(groups)
+    group_scores = {
+        name: (_group_mean(trials[0], frames, score), _group_mean(blind[chosen[name]], frames, score))
+        for name, frames in members.items()
+    }
+    return HeldOut(chosen=chosen, scores=scores, base_scores=trials[0].scores, group_scores=group_scores)
+
+
+def _members(groups: Mapping[str, str]) -> dict[str, list[str]]:
+    members: dict[str, list[str]] = {}
+    for frame, group in groups.items():
+        members.setdefault(group, []).append(frame)
+    return members
+
+
+def _group_mean(
+    trial: Trial[Match], frames: Sequence[str], score: Callable[[Iterable[Match]], float]
+) -> float:
+    return float(np.mean([score(copy[frame] for frame in frames) for copy in trial.matches]))

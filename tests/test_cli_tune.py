@@ -1,0 +1,171 @@
+"""`jaxbox tune` from end to end on small sweeps: what it writes, what it refuses, and being interrupted."""
+
+import csv
+import dataclasses
+import json
+
+import pytest
+from typer.testing import CliRunner
+
+import jaxbox
+from jaxbox import synthetic
+from jaxbox.cli import app, cache
+from jaxbox.detector import count_compilations
+from jaxbox.io import objects_from_detections, write_bin, write_calibration, write_labels
+from jaxbox.tuning import Bench
+from jaxbox.types import PointCloud
+
+NUM_SWEEPS = 3
+FILES = ["best.json", "report.json", "report.md", "trials.csv"]
+# Cars of this length are completed to boxes that overlap with none of the labels enough.
+WRONG = "vehicles.classes.0.length_m=6.2"
+SEARCH = "vehicles.classes.0.length_m=3.6:4.4"
+
+
+@pytest.fixture(autouse=True)
+def _no_user_cache(monkeypatch):
+    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
+
+
+@pytest.fixture(scope="module")
+def kitti_folder(tmp_path_factory):
+    """Small synthetic sweeps; what the default settings find in them are their labels."""
+    root = tmp_path_factory.mktemp("kitti") / "training"
+    for folder in ("velodyne", "calib", "label_2"):
+        (root / folder).mkdir(parents=True)
+    for seed in range(NUM_SWEEPS):
+        sweep = synthetic.make_sweep(seed, num_azimuths=250)
+        name = f"{seed:06d}"
+        write_bin(root / "velodyne" / f"{name}.bin", sweep.xyz, sweep.intensity)
+        write_calibration(root / "calib" / f"{name}.txt", sweep.calibration)
+        found = jaxbox.detect(PointCloud.from_numpy(sweep.xyz, sweep.intensity))
+        objects = objects_from_detections(found, sweep.calibration)
+        labels = [dataclasses.replace(item, truncation=0, occlusion=0, score=None) for item in objects]
+        write_labels(root / "label_2" / f"{name}.txt", labels)
+    return root
+
+
+@pytest.fixture
+def drives(tmp_path):
+    path = tmp_path / "drives.txt"
+    path.write_text("".join(f"{seed:06d} drive_{seed}\n" for seed in range(NUM_SWEEPS)))
+    return path
+
+
+def tune(kitti_folder, output, *arguments):
+    options = ("tune", "--labels", kitti_folder, "--output", output, "--copies", 1, *arguments)
+    return CliRunner().invoke(app, [str(option) for option in options])
+
+
+def read_report(output):
+    return json.loads((output / "report.json").read_text())
+
+
+def test_a_wrong_base_is_told_from_a_better_setting_on_drives_left_out(kitti_folder, drives, tmp_path):
+    output = tmp_path / "tune"
+    arguments = ("--set", WRONG, "--search", SEARCH, "--trials", 4, "--drives", drives)
+    result = tune(kitti_folder, output, *arguments)
+    assert result.exit_code == 0, result.output
+    assert sorted(path.name for path in output.iterdir()) == FILES
+    report = read_report(output)
+    assert [row["trial"] for row in report["trials"]] == [0, 1, 2, 3]
+    assert report["trials"][0]["changes"] == {}
+    assert report["base"]["mean"] < report["held_out"]["mean"] <= report["best"]["mean"] <= report["ceiling"]
+    assert [row["group"] for row in report["held_out"]["groups"]] == ["drive_0", "drive_1", "drive_2"]
+    assert not report["held_out"]["keep_base"]
+    assert f"Take trial {report['best']['trial']}" in result.stdout
+    assert f"Take trial {report['best']['trial']}" in (output / "report.md").read_text()
+    best = json.loads((output / "best.json").read_text())
+    assert best == report["best"]["changes"]
+    assert 3.6 <= best["vehicles.classes.0.length_m"] <= 4.4
+
+
+def test_no_trial_compiles_the_detector_again(kitti_folder, tmp_path):
+    assert tune(kitti_folder, tmp_path / "a", "--trials", 1).exit_code == 0
+    before = count_compilations()
+    result = tune(kitti_folder, tmp_path / "b", "--trials", 3)
+    assert result.exit_code == 0, result.output
+    assert count_compilations() == before
+    assert read_report(tmp_path / "b")["num_compilations"] == 0
+
+
+def test_the_seed_decides_the_trials_and_refining_follows_them(kitti_folder, tmp_path):
+    arguments = ("--set", WRONG, "--search", SEARCH, "--trials", 5, "--refine", 2, "--seed")
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        result = tune(kitti_folder, tmp_path / name, *arguments, seed)
+        assert result.exit_code == 0, result.output
+    files = {name: (tmp_path / name / "trials.csv").read_text() for name in "abc"}
+    assert files["a"] == files["b"] != files["c"]
+    rows = list(csv.DictReader(files["a"].splitlines()))
+    assert [row["blind"] for row in rows] == ["True"] * 3 + ["False"] * 2
+    assert rows[0]["vehicles.classes.0.length_m"] == "6.2"
+
+
+def test_without_drives_each_sweep_is_left_out_and_the_report_says_so(kitti_folder, tmp_path):
+    result = tune(kitti_folder, tmp_path / "tune", "--trials", 1)
+    assert read_report(tmp_path / "tune")["num_groups"] == NUM_SWEEPS
+    for text in (result.stdout, (tmp_path / "tune" / "report.md").read_text()):
+        assert "No drives were given" in text
+        assert "Keep the base" in text
+
+
+def interrupt_at(monkeypatch, index):
+    run = Bench.run
+
+    def interrupted(bench, trial, *arguments, **options):
+        if trial == index:
+            raise KeyboardInterrupt
+        return run(bench, trial, *arguments, **options)
+
+    monkeypatch.setattr(Bench, "run", interrupted)
+
+
+def test_interrupted_it_reports_the_trials_that_are_done(kitti_folder, tmp_path, monkeypatch):
+    interrupt_at(monkeypatch, 2)
+    output = tmp_path / "tune"
+    result = tune(kitti_folder, output, "--trials", 9)
+    assert result.exit_code == 1
+    assert sorted(path.name for path in output.iterdir()) == FILES
+    report = read_report(output)
+    assert report["interrupted"]
+    assert len(report["trials"]) == 2
+    assert report["held_out"] is not None
+    assert "2 of 9 trials (interrupted; seed 0)" in result.stdout
+    assert len((output / "trials.csv").read_text().splitlines()) == 1 + 2
+
+
+def test_interrupted_before_the_base_is_scored_it_writes_nothing(kitti_folder, tmp_path, monkeypatch):
+    interrupt_at(monkeypatch, 0)
+    result = tune(kitti_folder, tmp_path / "tune")
+    assert result.exit_code == 1
+    assert "nothing to report" in result.stderr
+    assert list((tmp_path / "tune").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (("--search", "box.num_angles=10:90"), "box.num_angles is static"),
+        (("--search", "vehicles.ring_wieght=1:2"), "nearest traced settings: vehicles.ring_weight"),
+        (("--search", "vehicles.ring_m=1:2", "--search", "vehicles.ring_m=1:3"), "stands there twice"),
+        (("--objective", "f1"), "choose one of soft, 3d, bev"),
+        (("--drives", "nowhere.txt"), "nowhere.txt"),
+        (("--copies", "99"), "copies"),
+        (("--trials", "0"), "trials"),
+    ],
+)
+def test_what_cannot_be_searched_ends_with_exit_code_2(kitti_folder, tmp_path, arguments, expected):
+    result = tune(kitti_folder, tmp_path / "tune", *arguments)
+    assert result.exit_code == 2
+    assert expected in result.stderr
+    assert not (tmp_path / "tune").exists()
+
+
+def test_sweeps_without_labels_are_refused(kitti_folder, tmp_path):
+    result = tune(kitti_folder / "velodyne" / "000000.bin", tmp_path / "tune", "--trials", 1)
+    assert result.exit_code == 0, "a sweep knows its labels"
+    (tmp_path / "bare").mkdir()
+    (tmp_path / "bare" / "0.bin").write_bytes((kitti_folder / "velodyne" / "000000.bin").read_bytes())
+    refused = tune(tmp_path / "bare", tmp_path / "none")
+    assert refused.exit_code == 2
+    assert "no sweep there has labels" in refused.stderr
