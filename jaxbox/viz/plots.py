@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DIMENSIONS = ("length", "width", "height")
+ROW_NAME = "matched vehicle"
 _ESTIMATE_COLORS = ("tab:blue", "tab:orange", "tab:green")
 
 
@@ -34,13 +35,16 @@ def _checked_sizes(estimated: np.ndarray, true: np.ndarray) -> tuple[np.ndarray,
     return estimated, true
 
 
-def plot_dimensions(estimated: np.ndarray, true: np.ndarray, *, title: str = "") -> "Figure":
+def plot_dimensions(
+    estimated: np.ndarray, true: np.ndarray, *, title: str = "", row_name: str = ROW_NAME
+) -> "Figure":
     """Plots estimated and true length, width and height over the matched vehicles (figure 12).
 
     Args:
       estimated: (n, 3) m: length, width, height.
       true: (n, 3) m, row by row the same vehicles.
       title: title of the figure.
+      row_name: what a row is.
 
     Returns:
       A matplotlib figure; write it with `save_figure`.
@@ -59,20 +63,24 @@ def plot_dimensions(estimated: np.ndarray, true: np.ndarray, *, title: str = "")
             frames, estimated[:, axis], "o--", color=color, markersize=4, linewidth=1, label="estimated"
         )
         axes.set_ylabel(f"{name} (m)")
+        axes.xaxis.get_major_locator().set_params(integer=True)
         axes.grid(alpha=0.3)
-        axes.legend(loc="upper right")
-    figure.axes[-1].set_xlabel("matched vehicle")
+        axes.legend()
+    figure.axes[-1].set_xlabel(row_name)
     figure.suptitle(title or f"Estimated and true dimensions of {len(true)} matched vehicles")
     return figure
 
 
-def plot_residuals(estimated: np.ndarray, true: np.ndarray, *, title: str = "") -> "Figure":
+def plot_residuals(
+    estimated: np.ndarray, true: np.ndarray, *, title: str = "", row_name: str = ROW_NAME
+) -> "Figure":
     """Plots estimated minus true length, width and height (figure 13).
 
     Args:
       estimated: (n, 3) m: length, width, height.
       true: (n, 3) m, row by row the same vehicles.
       title: title of the figure.
+      row_name: what a row is.
 
     Returns:
       A matplotlib figure; write it with `save_figure`.
@@ -90,8 +98,9 @@ def plot_residuals(estimated: np.ndarray, true: np.ndarray, *, title: str = "") 
         mean = f", mean {residuals[:, axis].mean():+.2f} m" if len(residuals) else ""
         axes.plot(frames, residuals[:, axis], "o-", color=color, markersize=4, label=f"{name}{mean}")
     axes.axhline(0.0, color="k", linewidth=1)
-    axes.set_xlabel("matched vehicle")
+    axes.set_xlabel(row_name)
     axes.set_ylabel("estimated - true (m)")
+    axes.xaxis.get_major_locator().set_params(integer=True)
     axes.grid(alpha=0.3)
     axes.legend()
     figure.suptitle(title or f"Residuals of {len(true)} matched vehicles (below 0: underestimated)")
