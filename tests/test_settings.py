@@ -6,7 +6,7 @@ import jax
 import pytest
 
 from jaxbox.config import DetectorConfig
-from jaxbox.settings import check_traced, parse_change, replace_settings, traced_settings
+from jaxbox.settings import changed_settings, check_traced, parse_change, replace_settings, traced_settings
 
 PRESETS = list(DetectorConfig.presets().values())
 
@@ -35,6 +35,13 @@ def test_several_changes_are_made_together_and_the_rest_stays():
     assert changed.clustering.maps[2].min_height_m == 0.4
     assert changed.clustering.maps[:2] == base.clustering.maps[:2]
     assert changed.vehicles == base.vehicles
+
+
+def test_what_was_changed_is_what_changes_the_base_into_it():
+    changes = {"box.criterion": "closeness", "clustering.maps.2.min_height_m": 0.4, "box.max_slab_points": 9}
+    base = DetectorConfig()
+    assert changed_settings(replace_settings(base, changes), base) == changes
+    assert changed_settings(base, base) == {}
 
 
 @pytest.mark.parametrize(
