@@ -63,7 +63,7 @@ def plot_dimensions(
             frames, estimated[:, axis], "o--", color=color, markersize=4, linewidth=1, label="estimated"
         )
         axes.set_ylabel(f"{name} (m)")
-        axes.xaxis.get_major_locator().set_params(integer=True)
+        axes.locator_params(axis="x", integer=True)
         axes.grid(alpha=0.3)
         axes.legend()
     figure.axes[-1].set_xlabel(row_name)
@@ -100,7 +100,7 @@ def plot_residuals(
     axes.axhline(0.0, color="k", linewidth=1)
     axes.set_xlabel(row_name)
     axes.set_ylabel("estimated - true (m)")
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.locator_params(axis="x", integer=True)
     axes.grid(alpha=0.3)
     axes.legend()
     figure.suptitle(title or f"Residuals of {len(true)} matched vehicles (below 0: underestimated)")
