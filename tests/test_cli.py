@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import jaxbox
 from jaxbox import synthetic
 from jaxbox.cli import app, cache, demo, eval_pictures
-from jaxbox.cli.report import FrameReport, RunReport, describe_frame, describe_run
+from jaxbox.cli.report import SHOWN_MIN_SCORE, FrameReport, RunReport, describe_frame, describe_run
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation.report import read_folders
 from jaxbox.io import (
@@ -96,6 +96,20 @@ def test_both_formats_hold_the_same_boxes(detected):
         scores = {round(box["score"], 5) for box in record["boxes"]}
         assert lines, "a street has vehicles"
         assert {round(line.score, 5) for line in lines} <= scores, "the camera sees some of them"
+
+
+def test_detect_writes_every_score_and_cuts_where_asked(kitti_folder, detected, tmp_path):
+    output, _ = detected
+    sweep = make_small_sweep(0)
+    found = jaxbox.detect(PointCloud.from_numpy(sweep.xyz, sweep.intensity), DetectorConfig())
+    scores = [item.score for item in read_labels(output / "000000.txt")]
+    assert scores == pytest.approx([item.score for item in objects_from_detections(found, sweep.calibration)])
+    assert min(scores) < SHOWN_MIN_SCORE, "average precision needs the low scores too"
+    file = kitti_folder / "velodyne" / "000000.bin"
+    result = run("detect", file, "--output", tmp_path, "--no-pictures", "--min-score", SHOWN_MIN_SCORE)
+    assert result.exit_code == 0, result.output
+    kept = [item.score for item in read_labels(tmp_path / "000000.txt")]
+    assert kept == [score for score in scores if score >= SHOWN_MIN_SCORE]
 
 
 def test_detect_prints_counts_a_sweep_and_a_summary_with_compiling_apart(detected):

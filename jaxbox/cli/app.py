@@ -98,7 +98,12 @@ def detect(
     ] = None,
     min_score: Annotated[
         float,
-        typer.Option(min=0.0, max=1.0, help="Leave out lower scores. 0 keeps all, as `eval` wants it."),
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help="Leave out lower scores. 0 keeps all, as `eval` wants it; "
+            f"pictures and counts never show less than {SHOWN_MIN_SCORE:g}.",
+        ),
     ] = 0.0,
     pictures: Annotated[bool, typer.Option(help="Draw pictures of each sweep.")] = True,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only what went wrong.")] = False,
