@@ -1,0 +1,195 @@
+"""What each component of the default preset is worth: leave one out, over turned and mirrored copies.
+
+    python -m benchmarks.bench_ablation --copies 3 --json ablation.json
+    python -m benchmarks.bench_ablation --only "one plane" --only "no filter"
+
+Each row changes a few settings of the preset. Every row sees the same copies of the same frames, so its
+difference from the full preset is taken copy by copy: the copies' own spread cancels. A difference within
+two of its standard errors is not evidence; as all copies come of the same few frames, even one beyond may
+be particular to them. Settings that are thresholds share one compiled program.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks import bench_accuracy, common
+from jaxbox import DetectorConfig
+from jaxbox.evaluation.copies import COPIES, Copy, Frame, label_points, read_frame
+from jaxbox.io import open_sweeps
+from jaxbox.settings import replace_settings
+
+FULL = "default preset"
+NO_LIMIT = 1e6
+"""A width or a gate that no value reaches."""
+MORE_POINTS = {"clustering.max_obstacles": 131072, "box.max_slab_points": 65536}
+"""Room for rows that take more points for obstacles, or fit to more: theirs is no error of capacity."""
+MORE_DETECTIONS = {"vehicles.max_detections": 512}
+"""Room for rows that reject less."""
+
+COLUMNS = ("SOFT", "bev moderate", "3d moderate", "recall bev 0.5", "recall bev 0.7", "recall 3d 0.7")
+
+
+@dataclasses.dataclass(frozen=True)
+class Ablation:
+    """One component left out or replaced."""
+
+    name: str
+    changes: Mapping[str, Any]
+    """New values by dotted setting name."""
+
+
+def _without_maps(*indices: int) -> dict[str, Any]:
+    """No point is low enough for these component maps."""
+    return {f"clustering.maps.{index}.max_height_m": 0.0 for index in indices}
+
+
+ABLATIONS = (
+    # Points.
+    Ablation("no filter", {"filtering.enabled": False}),
+    Ablation("one plane instead of the ground grid", {"ground.surface": False, **MORE_POINTS}),
+    # Proposals.
+    Ablation("one map: 0.2 m", _without_maps(1, 2, 3)),
+    Ablation("one map: 0.35 m", {"clustering.maps.0.cell_m": 0.35, **_without_maps(1, 2, 3)}),
+    Ablation("maps without 0.35 m", _without_maps(1)),
+    Ablation("maps without 0.1 m", _without_maps(2)),
+    Ablation("maps without 0.5 m", _without_maps(3)),
+    Ablation("cells that do not grow with range", {"clustering.adaptive_growth": 0.0}),
+    # Rectangle.
+    Ablation("rectangle of points up to 2.0 m", {"box.slab_max_height_m": 2.0, **MORE_POINTS}),
+    Ablation("closeness to all four edges", {"box.criterion": "closeness"}),
+    Ablation("no scene direction", {"box.direction_weight": 0.0}),
+    Ablation("64 points a rectangle", {"box.max_points": 64}),
+    Ablation("256 points a rectangle", {"box.max_points": 256}),
+    # Completion.
+    Ablation("no hypotheses: longer side extended away, no gate", {"completion.mode": "away"}),
+    Ablation("no hypotheses, evidence or scene direction", {
+        "completion.mode": "away", "evidence.enabled": False, **MORE_DETECTIONS,
+    }),
+    Ablation("hypotheses blind to free space", {
+        "completion.free_weight": 0.0, "completion.free_length_weight": 0.0,
+    }),
+    Ablation("no lowest box height", {"vehicles.classes.0.min_box_height_m": 0.0}),
+    # Score.
+    Ablation("no free length, no objective in the score", {
+        "vehicles.free_scale": NO_LIMIT, "vehicles.objective_gate": -NO_LIMIT, **MORE_DETECTIONS,
+    }),
+    Ablation("no free length in the score", {"vehicles.free_scale": NO_LIMIT}),
+    Ablation("no objective in the score", {"vehicles.objective_gate": -NO_LIMIT}),
+    Ablation("no ring, no overhead penalty", {"vehicles.ring_weight": 0.0, "vehicles.overhead_weight": 0.0}),
+    Ablation("no ring penalty", {"vehicles.ring_weight": 0.0}),
+    Ablation("no overhead penalty", {"vehicles.overhead_weight": 0.0}),
+    Ablation("no ground support", {"vehicles.support_points": 1 / NO_LIMIT}),
+    Ablation("no sparseness", {"vehicles.sparseness_power": 0.0}),
+    Ablation("height gate that does not widen with range", {"vehicles.top_grade": 0.0}),
+    Ablation("cars only, no vans and trucks", {"vehicles.large_height_m": NO_LIMIT}),
+)  # fmt: skip
+
+
+def copy_figures(
+    frames: Sequence[Frame],
+    num_points: Mapping[str, np.ndarray],
+    copy: Copy,
+    config: DetectorConfig,
+) -> tuple[dict[str, float], list[int]]:
+    """The figures of one copy of the frames, and its status bits."""
+    results, bits = bench_accuracy.detect_frames(frames, copy, config)
+    labels = {frame.name: frame.labels for frame in frames}
+    found = bench_accuracy.figures(bench_accuracy.measure(labels, results, num_points))
+    return {column: found[column] for column in COLUMNS}, bits
+
+
+def compare(
+    rows: Mapping[str, Mapping[str, float]], full: Mapping[str, Mapping[str, float]]
+) -> dict[str, dict[str, float | None]]:
+    """Each figure's mean and spread over the copies, and its difference from the full preset, copy by copy.
+
+    Args:
+      rows: the figures of each copy.
+      full: those of the full preset, of the same copies.
+
+    Returns:
+      Of each figure: mean, sd (over the copies), difference, and its standard error; None for one copy.
+    """
+    summary = {}
+    for column in next(iter(rows.values())):
+        values = np.array([rows[copy][column] for copy in full])
+        difference = values - np.array([full[copy][column] for copy in full])
+        several = len(values) > 1
+        summary[column] = {
+            "mean": float(values.mean()),
+            "sd": float(values.std(ddof=1)) if several else None,
+            "difference": float(difference.mean()),
+            "difference_error": float(difference.std(ddof=1) / np.sqrt(len(values))) if several else None,
+        }
+    return summary
+
+
+def measure(
+    frames: Sequence[Frame], copies: Sequence[Copy], ablations: Sequence[Ablation], base: DetectorConfig
+) -> dict[str, dict[str, Any]]:
+    """Every ablation, and the full preset first, over the copies."""
+    num_points = {frame.name: label_points(frame) for frame in frames}
+    table: dict[str, dict[str, Any]] = {}
+    for ablation in (Ablation(FULL, {}), *ablations):
+        config = replace_settings(base, ablation.changes)
+        by_copy, statuses = {}, []
+        for copy in copies:
+            by_copy[copy.name], bits = copy_figures(frames, num_points, copy, config)
+            statuses += bits
+        table[ablation.name] = row = {
+            "changes": dict(ablation.changes),
+            "copies": by_copy,
+            "status": common.status_names(statuses),
+        }
+        row["summary"] = compare(by_copy, table[FULL]["copies"])
+        print_row(ablation.name, row)
+    return table
+
+
+def print_header() -> None:
+    columns = "  ".join(column.rjust(14) for column in COLUMNS)
+    print(f"{'left out':50} {columns}  {'SOFT - full':>16}", flush=True)
+
+
+def print_row(name: str, row: Mapping[str, Any]) -> None:
+    """One line as soon as it is known: the whole table takes minutes."""
+    cells = [_with_error(row["summary"][column], "mean", "sd") for column in COLUMNS]
+    difference = _with_error(row["summary"]["SOFT"], "difference", "difference_error")
+    status = f"  {', '.join(row['status'])}" if row["status"] else ""
+    line = "  ".join(cell.rjust(14) for cell in cells)
+    print(f"{name:50} {line}  {difference:>16}{status}", flush=True)
+
+
+def _with_error(values: Mapping[str, float | None], mean: str, error: str) -> str:
+    spread = values[error]
+    return f"{values[mean]:.3g}" if spread is None else f"{values[mean]:.3g} +-{spread:.2g}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = common.parser(__doc__ or "")
+    parser.add_argument("--copies", type=int, default=len(COPIES), choices=range(1, len(COPIES) + 1))
+    parser.add_argument(
+        "--only",
+        action="append",
+        choices=[ablation.name for ablation in ABLATIONS],
+        metavar="NAME",
+        help="only this row, beside the full preset; repeat for more",
+    )
+    options = parser.parse_args(arguments)
+    chosen = [ablation for ablation in ABLATIONS if not options.only or ablation.name in options.only]
+    base = common.chosen_config(options)
+    sweeps = open_sweeps(common.data_folder("kitti_object"))
+    frames = [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
+    copies = COPIES[: options.copies]
+    print(f"Car, R40, mean +-sd over {len(copies)} copies of {len(frames)} frames; recall: moderate;")
+    print("difference from the full preset, paired over copies, +-standard error")
+    print_header()
+    table = measure(frames, copies, chosen, base)
+    common.write_report({"num_frames": len(frames), "rows": table}, options)
+
+
+if __name__ == "__main__":
+    main()
