@@ -174,19 +174,22 @@ _CRITERIA = {
 }
 
 
-def best_rectangles(curve: jax.Array, extents: Extents, preference: jax.Array) -> Rectangles:
+def best_rectangles(
+    curve: jax.Array, extents: Extents, preference: jax.Array, *, insistence: float = 1.0
+) -> Rectangles:
     """The rectangle at each cluster's best rotation.
 
     Args:
       curve: (P, A) float32, see `try_rotations`.
       extents: see `try_rotations`.
       preference: (A,) float32, added to every curve.
+      insistence: how often the preference counts when the rotation is chosen; its worth counts it once.
 
     Returns:
       The rectangles; of equally good rotations the first.
     """
     total = curve + preference
-    best = jnp.argmax(total, axis=1)[:, None]
+    best = jnp.argmax(curve + insistence * preference, axis=1)[:, None]
     u0, u1, v0, v1 = (jnp.take_along_axis(e, best, axis=1)[:, 0] for e in extents)
     return Rectangles(
         angle=best[:, 0] * (math.pi / 2 / curve.shape[1]),

@@ -20,6 +20,9 @@ FACE_OVERHANG_M = 0.3
 NUM_PLACEMENTS = 3
 """Where a completed width goes: away from the sensor, towards it, or both ways."""
 
+SEEN_RAMP = 0.05
+"""Fraction of the usual size over which a side goes from partly hidden to seen whole."""
+
 CERTAIN = 1e3
 """Objective of a box that was not held against evidence: it passes any gate on the objective."""
 
@@ -35,15 +38,65 @@ def _sides(rectangle: Rectangles) -> tuple[jax.Array, jax.Array, jax.Array]:
     return low, high, yaw
 
 
-def _extend(low: jax.Array, high: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Centres (..., 3) and size of an interval grown to `size`: from the near end, the far end, both."""
-    grown = jnp.maximum(size, high - low)
-    from_low, from_high, middle = low + grown / 2, high - grown / 2, (low + high) / 2
+def usual_sizes(rectangle: Rectangles, length_m: jax.Array, width_m: jax.Array) -> jax.Array:
+    """The class's size, or the measured where that is larger.
+
+    Args:
+      rectangle: P rectangles.
+      length_m: (P,) float32, m, of the class.
+      width_m: (P,) float32, m, of the class.
+
+    Returns:
+      (P, 2 ways, 2) float32, m: length and width, with either side as the length.
+    """
+    low, high, _ = _sides(rectangle)
+    return jnp.maximum(jnp.stack([length_m, width_m], axis=-1)[:, None], high - low)
+
+
+def likely_sizes(
+    rectangle: Rectangles,
+    length_m: jax.Array,
+    width_m: jax.Array,
+    *,
+    seen_length: jax.Array | float,
+    seen_width: jax.Array | float,
+    seen_weight: jax.Array | float,
+    length_margin_m: jax.Array | float,
+    width_margin_m: jax.Array | float,
+) -> jax.Array:
+    """The class's size for sides that may be hidden in part; between it and the measured for the others.
+
+    Args:
+      rectangle: P rectangles.
+      length_m: (P,) float32, m, of the class.
+      width_m: (P,) float32, m, of the class.
+      seen_length: fraction of the class's length from which a side may be seen whole.
+      seen_width: the same of its width.
+      seen_weight: what the measured size of such a side weighs against the class's.
+      length_margin_m: measured lengths read short by this, m.
+      width_margin_m: measured widths read short by this, m.
+
+    Returns:
+      (P, 2 ways, 2) float32, m: as `usual_sizes`; at least as measured.
+
+    Reference: oracle `jaxbox.reference.likely_size`.
+    """
+    low, high, _ = _sides(rectangle)
+    measured = high - low
+    usual = jnp.stack([length_m, width_m], axis=-1)[:, None]
+    seen, margin = jnp.array([seen_length, seen_width]), jnp.array([length_margin_m, width_margin_m])
+    whole = jnp.clip((measured / usual - seen) / SEEN_RAMP, 0, 1)
+    return jnp.maximum(usual + seen_weight * whole * (measured + margin - usual), measured)
+
+
+def _extend(low: jax.Array, high: jax.Array, size: jax.Array) -> jax.Array:
+    """Centres (..., 3) of an interval grown to `size`: from the near end, the far end, both."""
+    from_low, from_high, middle = low + size / 2, high - size / 2, (low + high) / 2
     # The same as |low| < |high|, but right for a side without extent too: it grows away.
     low_is_near = low + high > 0
     away = jnp.where(low_is_near, from_low, from_high)
     towards = jnp.where(low_is_near, from_high, from_low)
-    return jnp.stack([away, towards, middle], axis=-1), grown
+    return jnp.stack([away, towards, middle], axis=-1)
 
 
 def keep_measured(rectangle: Rectangles, *, max_length_m: jax.Array, max_width_m: jax.Array) -> Boxes:
@@ -57,41 +110,27 @@ def keep_measured(rectangle: Rectangles, *, max_length_m: jax.Array, max_width_m
     Returns:
       Boxes (P,); no box where a measured side is too long.
     """
-    zero = jnp.zeros_like(rectangle.angle)
-    return _longer_side(rectangle, zero, zero, max_length_m, max_width_m)
+    low, high, _ = _sides(rectangle)
+    return extend_away(rectangle, high - low, max_length_m=max_length_m, max_width_m=max_width_m)
 
 
 def extend_away(
-    rectangle: Rectangles,
-    *,
-    length_m: jax.Array,
-    width_m: jax.Array,
-    max_length_m: jax.Array,
-    max_width_m: jax.Array,
+    rectangle: Rectangles, sizes: jax.Array, *, max_length_m: jax.Array, max_width_m: jax.Array
 ) -> Boxes:
-    """Extends short sides to the class prior, away from the sensor, the longer side as length.
+    """Completes both sides away from the sensor, the longer side as length.
 
     The sensor sees the near ends of both sides; what is missing is behind them.
 
     Args:
       rectangle: P rectangles.
-      length_m: (P,) float32, m, the prior.
-      width_m: (P,) float32, m, the prior.
+      sizes: (P, 2 ways, 2) float32, m, see `likely_sizes`.
       max_length_m: (P,) float32, m.
       max_width_m: (P,) float32, m.
 
     Returns:
       Boxes (P,); no box where a measured side is too long.
     """
-    return _longer_side(rectangle, length_m, width_m, max_length_m, max_width_m)
-
-
-def _longer_side(
-    rectangle: Rectangles, length: jax.Array, width: jax.Array, max_length: jax.Array, max_width: jax.Array
-) -> Boxes:
-    boxes = box_hypotheses(
-        rectangle, length_m=length, width_m=width, max_length_m=max_length, max_width_m=max_width
-    )
+    boxes = box_hypotheses(rectangle, sizes, max_length_m=max_length_m, max_width_m=max_width_m)
     way = (boxes.measured[:, NUM_PLACEMENTS, 0] > boxes.measured[:, 0, 0]).astype(jnp.int32)
     first = jax.tree.map(lambda a: a[jnp.arange(a.shape[0]), way * NUM_PLACEMENTS], boxes)
     objective = jnp.where(first.objective > NOT_A_BOX, CERTAIN, NOT_A_BOX)
@@ -99,12 +138,7 @@ def _longer_side(
 
 
 def box_hypotheses(
-    rectangle: Rectangles,
-    *,
-    length_m: jax.Array,
-    width_m: jax.Array,
-    max_length_m: jax.Array,
-    max_width_m: jax.Array,
+    rectangle: Rectangles, sizes: jax.Array, *, max_length_m: jax.Array, max_width_m: jax.Array
 ) -> Boxes:
     """The vehicles that may hide behind each rectangle: which side is the length, where the width goes.
 
@@ -112,8 +146,7 @@ def box_hypotheses(
 
     Args:
       rectangle: P rectangles.
-      length_m: (P,) float32, m, the prior.
-      width_m: (P,) float32, m, the prior.
+      sizes: (P, 2 ways, 2) float32, m, at least as measured: see `usual_sizes`, `likely_sizes`.
       max_length_m: (P,) float32, m, longest measured length.
       max_width_m: (P,) float32, m, widest measured width.
 
@@ -123,9 +156,9 @@ def box_hypotheses(
     Reference: oracle `jaxbox.reference.complete_box`.
     """
     low, high, yaw = _sides(rectangle)
-    centre_u, length = _extend(low[..., 0], high[..., 0], length_m[:, None])
-    centre_v, width = _extend(low[..., 1], high[..., 1], width_m[:, None])
-    u, v = centre_u[..., :1], centre_v
+    centre_u = _extend(low[..., 0], high[..., 0], sizes[..., 0])
+    v = _extend(low[..., 1], high[..., 1], sizes[..., 1])
+    u = centre_u[..., :1]
     cos, sin = jnp.cos(yaw)[..., None], jnp.sin(yaw)[..., None]
     center = jnp.stack([cos * u - sin * v, sin * u + cos * v], axis=-1)
     measured = high - low
@@ -137,8 +170,8 @@ def box_hypotheses(
 
     return Boxes(
         center=center.reshape(-1, 2 * NUM_PLACEMENTS, 2),
-        length=flat(length),
-        width=flat(width),
+        length=flat(sizes[..., 0]),
+        width=flat(sizes[..., 1]),
         yaw=flat(yaw),
         measured=flat(measured),
         objective=jnp.where(flat(fits), 0, NOT_A_BOX),
@@ -183,6 +216,7 @@ def point_agreement(boxes: Boxes, points: jax.Array, count: jax.Array) -> tuple[
 
 def choose_hypothesis(
     boxes: Boxes,
+    likely: Boxes,
     worth: jax.Array,
     *,
     hit: jax.Array,
@@ -202,8 +236,10 @@ def choose_hypothesis(
     J = hit - wf free - wl free_length + wi inside + wn near + wc worth - cost [width not away].
 
     Args:
-      boxes: (P, S) hypotheses, see `box_hypotheses`.
-      worth: (P,) float32, of the rectangle.
+      boxes: (P, S) hypotheses, see `box_hypotheses`, as the evidence judges them: a box of the class's
+        size asks more of it.
+      likely: (P, S) the same at their likely sizes, which are answered.
+      worth: (P, S) float32, of the rectangle.
       hit: (P, S) float32, fraction of rays.
       free: (P, S) float32, fraction of rays.
       free_length: (P, S) float32, fraction of the rays' length.
@@ -222,11 +258,11 @@ def choose_hypothesis(
     placement = jnp.arange(boxes.yaw.shape[1]) % NUM_PLACEMENTS
     objective = hit - free_weight * free - free_length_weight * free_length
     objective = objective + inside_weight * inside + near_weight * near
-    objective = objective + closeness_weight * worth[:, None] - not_away_cost * (placement > 0)
+    objective = objective + closeness_weight * worth - not_away_cost * (placement > 0)
     objective = jnp.where(boxes.objective > NOT_A_BOX, objective, NOT_A_BOX)
     best = jnp.argmax(objective, axis=1)
     rows = jnp.arange(best.shape[0])
-    chosen = jax.tree.map(lambda a: a[rows, best], boxes)
+    chosen = jax.tree.map(lambda a: a[rows, best], likely)
     return Boxes(
         chosen.center, chosen.length, chosen.width, chosen.yaw, chosen.measured, objective[rows, best]
     )

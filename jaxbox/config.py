@@ -14,11 +14,9 @@ import jax
 import numpy as np
 
 from jaxbox.capacities import CAPACITY_STEP, rough_counts
+from jaxbox.class_priors import CAR, TRUCK, VAN, ClassPrior, Scalar
 
 _T = TypeVar("_T")
-
-Scalar = float | jax.Array
-"""A traced threshold: a Python float, or an array scalar under `jax.vmap`."""
 
 
 def _static(default: Any) -> Any:
@@ -96,7 +94,7 @@ class GroundConfig:
     """static: the ground grid covers |x|, |y| below this; beyond it its border value holds."""
     num_envelope_rounds: int = _static(default=10)
     """static: cells over which the slope limit spreads."""
-    max_grade: Scalar = 0.2
+    max_grade: Scalar = 0.1
     """Steepest rise of the ground relative to the plane, m/m."""
     band_below_m: Scalar = 0.3
     """Points lower than the plane by more than this, at the sensor, are no ground."""
@@ -246,6 +244,19 @@ class CompletionConfig:
     mode: Literal["none", "away", "evidence"] = _static(default="evidence")
     """static: keep the rectangle as measured (the paper); extend its hidden sides away from the
     sensor; or let the evidence choose among hypotheses."""
+    along_scene: bool = _static(default=True)
+    """static: let the evidence also judge the rectangle along the scene's direction, where that is not
+    the best rotation by itself; needs ``box.scene_direction``."""
+    seen_length: Scalar = 0.72
+    """A side measured at least so long, as a fraction of the class's length, may be seen whole."""
+    seen_width: Scalar = 0.83
+    """As ``seen_length``, for the width."""
+    seen_weight: Scalar = 0.8
+    """What the measured size of such a side weighs against the class's; hidden sides have the class's."""
+    length_margin_m: Scalar = 0.35
+    """Lengths read short by this: bumpers are round, and the far one is seen last."""
+    width_margin_m: Scalar = 0.06
+    """Widths read short by this."""
     num_rays: int = _static(default=32)
     """static: rays over the box when hypotheses are compared."""
     num_final_rays: int = _static(default=48)
@@ -262,92 +273,6 @@ class CompletionConfig:
     """Worth of the rectangle criterion."""
     not_away_cost: Scalar = 0.02
     """Cost of a width that does not extend away from the sensor."""
-
-
-@_config
-class ClassPrior:
-    """One vehicle class: size prior and gates."""
-
-    length_m: Scalar
-    """Hidden lengths are completed to this, and scored against it."""
-    width_m: Scalar
-    """Hidden widths are completed to this, and scored against it."""
-    height_m: Scalar
-    """Heights are scored against this."""
-    length_below_m: Scalar
-    """Width of the length score below the prior, exp(-(d / w)^2)."""
-    length_above_m: Scalar
-    """Width of the length score above the prior."""
-    width_tolerance_m: Scalar
-    """Width of the width score."""
-    height_tolerance_m: Scalar
-    """Width of the height score."""
-    min_height_m: Scalar
-    """Lower tops, after the range allowance, are no such vehicle."""
-    max_height_m: Scalar
-    """Higher tops are no such vehicle."""
-    max_length_m: Scalar
-    """Longer measured extents are no such vehicle."""
-    max_width_m: Scalar
-    """Wider measured extents are no such vehicle."""
-    min_box_height_m: Scalar
-    """Boxes are at least so high: their tops read low."""
-    prior_weight: Scalar
-    """Factor of the score: how common the class is beside the car, softened."""
-    count_max_height_m: Scalar
-    """Points lower than this above the ground belong to the vehicle; higher ones within the box
-    speak against it."""
-
-
-# Sizes are medians over the 7,481 KITTI object label files; gates and widths were chosen on KITTI.
-CAR = ClassPrior(
-    length_m=3.9,
-    width_m=1.63,
-    height_m=1.5,
-    length_below_m=0.8,
-    length_above_m=2.0,
-    width_tolerance_m=0.3,
-    height_tolerance_m=0.3,
-    min_height_m=1.0,
-    max_height_m=2.3,
-    max_length_m=6.5,
-    max_width_m=2.4,
-    min_box_height_m=1.48,
-    prior_weight=1.0,
-    count_max_height_m=2.0,
-)
-VAN = ClassPrior(
-    length_m=4.98,
-    width_m=1.88,
-    height_m=2.13,
-    length_below_m=0.8,
-    length_above_m=1.5,
-    width_tolerance_m=0.3,
-    height_tolerance_m=0.35,
-    min_height_m=2.0,
-    max_height_m=2.7,
-    max_length_m=7.5,
-    max_width_m=2.6,
-    min_box_height_m=1.8,
-    prior_weight=0.5,
-    count_max_height_m=2.7,
-)
-TRUCK = ClassPrior(
-    length_m=10.81,
-    width_m=2.63,
-    height_m=3.34,
-    length_below_m=5.0,
-    length_above_m=4.0,
-    width_tolerance_m=0.4,
-    height_tolerance_m=0.8,
-    min_height_m=2.4,
-    max_height_m=4.2,
-    max_length_m=18.0,
-    max_width_m=3.2,
-    min_box_height_m=2.6,
-    prior_weight=0.3,
-    count_max_height_m=4.2,
-)
 
 
 @_config
@@ -391,6 +316,12 @@ class VehicleConfig:
     """score x exp(-weight x ring points / points)."""
     overhead_weight: Scalar = 8.0
     """score x exp(-weight x points above / points)."""
+    upper_height_m: Scalar = 0.9
+    """Points higher than this are glass, bonnet and roof; see ``ClassPrior.recess_m``."""
+    recess_share: Scalar = 0.4
+    """Full worth from this share of the upper points behind the faces on."""
+    upright_worth: Scalar = 0.2
+    """Worth of a box whose upper points are all on its faces: score x a factor from this to 1."""
     support_points: Scalar = 10.0
     """score x min(1, ground points round the box / this)."""
     objective_gate: Scalar = 2.4

@@ -21,6 +21,9 @@ LOOKUP_STEP = 128
 COUNT_BITS = 10
 """Bits that hold a count of up to `LOOKUP_STEP` points."""
 
+MIN_UPPER_POINTS = 3
+"""With fewer points as high as glass and roof, whether they lie behind the faces says nothing."""
+
 BOX_CHUNK = 32
 """Boxes looked at together: the loop over their points ends with the one that has most."""
 
@@ -41,11 +44,16 @@ class Surroundings:
     """(P,) float32: points higher than the vehicle, within the box."""
     num_ring: jax.Array
     """(P,) float32: points of vehicle height just outside."""
+    num_upper: jax.Array
+    """(P,) float32: those inside that are as high as glass, bonnet and roof."""
+    num_recessed: jax.Array
+    """(P,) float32: those of them that lie behind the faces which the sensor sees."""
 
 
 def count_points_around(
     boxes: jax.Array,
     count_max_height_m: jax.Array,
+    recess_m: jax.Array,
     num_boxes: jax.Array,
     xy: jax.Array,
     height: jax.Array,
@@ -56,12 +64,14 @@ def count_points_around(
     max_nearby: int,
     margin_m: jax.Array | float,
     ring_m: jax.Array | float,
+    upper_height_m: jax.Array | float,
 ) -> Surroundings:
     """Counts the points of the whole sweep in and round each box.
 
     Args:
       boxes: (P, 5) float32: x, y, length, width (m), yaw (rad).
       count_max_height_m: (P,) float32, m: points lower than this belong to the vehicle.
+      recess_m: (P,) float32, m: how far behind the faces that the sensor sees a point counts as recessed.
       num_boxes: () int32, rows that hold a box.
       xy: (N, 2) float32, m, all obstacle points.
       height: (N,) float32, m, above the ground.
@@ -71,6 +81,7 @@ def count_points_around(
       max_nearby: static; of more points near a box every so many are looked at, and count so often.
       margin_m: a point this far outside still counts as inside, m.
       ring_m: a point farther out than the margin and nearer than this is in the ring, m.
+      upper_height_m: points higher than this are glass, bonnet and roof, m.
 
     Returns:
       The counts; zero beyond `num_boxes`.
@@ -84,11 +95,11 @@ def count_points_around(
     order, start = group_by(jnp.where(member, index[:, 0] * shape[1] + index[:, 1], num_cells), num_cells)
     points = jnp.concatenate([xy, height[:, None]], axis=1)[order]
 
-    def look(rows: tuple[jax.Array, jax.Array]) -> Surroundings:
+    def look(rows: tuple[jax.Array, jax.Array, jax.Array]) -> Surroundings:
         first, length = _cell_runs(rows[0], start, shape, half_x_m, half_y_m, ring_m)
-        return _count_runs(*rows, first, length, points, max_nearby, margin_m, ring_m)
+        return _count_runs(*rows, first, length, points, max_nearby, margin_m, ring_m, upper_height_m)
 
-    return map_rows(look, (boxes, count_max_height_m), num_rows=num_boxes, chunk=BOX_CHUNK)
+    return map_rows(look, (boxes, count_max_height_m, recess_m), num_rows=num_boxes, chunk=BOX_CHUNK)
 
 
 def _cell_runs(
@@ -120,12 +131,14 @@ def _cell_runs(
 def _count_runs(
     boxes: jax.Array,
     count_max_height_m: jax.Array,
+    recess_m: jax.Array,
     first: jax.Array,
     length: jax.Array,
     points: jax.Array,
     max_nearby: int,
     margin_m: jax.Array | float,
     ring_m: jax.Array | float,
+    upper_height_m: jax.Array | float,
 ) -> Surroundings:
     """Counts over the runs of points, every `stride`-th where they are too many."""
     end = jnp.cumsum(length, axis=1)
@@ -133,6 +146,12 @@ def _count_runs(
     stride = jnp.maximum((total + max_nearby - 1) // max_nearby, 1)
     num_looks = (total + stride - 1) // stride
     cos, sin = jnp.cos(boxes[:, 4])[:, None], jnp.sin(boxes[:, 4])[:, None]
+    half_l, half_w = boxes[:, 2:3] / 2, boxes[:, 3:4] / 2
+    # The sensor at the origin, in the box's frame: it sees the faces on its side of the box.
+    sensor_u = -(boxes[:, :1] * cos + boxes[:, 1:2] * sin)
+    sensor_v = boxes[:, :1] * sin - boxes[:, 1:2] * cos
+    face_u = jnp.where(jnp.abs(sensor_u) > half_l, half_l, jnp.inf)
+    face_v = jnp.where(jnp.abs(sensor_v) > half_w, half_w, jnp.inf)
 
     def step(k: jax.Array, state: Surroundings) -> Surroundings:
         place = (k * LOOKUP_STEP + jnp.arange(LOOKUP_STEP)) * stride[:, None]
@@ -140,8 +159,8 @@ def _count_runs(
         base = jnp.take_along_axis(first - (end - length), run, axis=1)
         p = take(points, base + place)
         dx, dy = p[..., 0] - boxes[:, :1], p[..., 1] - boxes[:, 1:2]
-        out_u = jnp.abs(dx * cos + dy * sin) - boxes[:, 2:3] / 2
-        out_v = jnp.abs(dy * cos - dx * sin) - boxes[:, 3:4] / 2
+        u, v = dx * cos + dy * sin, dy * cos - dx * sin
+        out_u, out_v = jnp.abs(u) - half_l, jnp.abs(v) - half_w
         out = jnp.where(place < total[:, None], jnp.maximum(out_u, out_v), jnp.inf)
         low = p[..., 2] < count_max_height_m[:, None]
         inside = out < margin_m
@@ -150,20 +169,26 @@ def _count_runs(
         kind = jnp.where(~inside & (out < ring_m) & low, 1 << 2 * COUNT_BITS, kind)
         counts = jnp.sum(kind, axis=1)
         top = jnp.max(jnp.where(inside & low, p[..., 2], 0), axis=1)
+        upper = inside & low & (p[..., 2] > upper_height_m)
+        depth = jnp.minimum(face_u - jnp.sign(sensor_u) * u, face_v - jnp.sign(sensor_v) * v)
+        recessed = jnp.where(upper & (depth > recess_m[:, None]), 1 << COUNT_BITS, 0)
+        high_counts = jnp.sum(upper + recessed, axis=1)
 
-        def add(place: int) -> jax.Array:
-            return stride * ((counts >> place * COUNT_BITS) & (2**COUNT_BITS - 1)).astype(jnp.float32)
+        def add(packed: jax.Array, place: int) -> jax.Array:
+            return stride * ((packed >> place * COUNT_BITS) & (2**COUNT_BITS - 1)).astype(jnp.float32)
 
         return Surroundings(
-            num_inside=state.num_inside + add(0),
+            num_inside=state.num_inside + add(counts, 0),
             top=jnp.maximum(state.top, top),
-            num_above=state.num_above + add(1),
-            num_ring=state.num_ring + add(2),
+            num_above=state.num_above + add(counts, 1),
+            num_ring=state.num_ring + add(counts, 2),
+            num_upper=state.num_upper + add(high_counts, 0),
+            num_recessed=state.num_recessed + add(high_counts, 1),
         )
 
     zero = jnp.zeros(boxes.shape[0])
     steps = (jnp.max(num_looks) + LOOKUP_STEP - 1) // LOOKUP_STEP
-    return jax.lax.fori_loop(0, steps, step, Surroundings(zero, zero, zero, zero))
+    return jax.lax.fori_loop(0, steps, step, Surroundings(*[zero] * len(dataclasses.fields(Surroundings))))
 
 
 def bell(
@@ -256,6 +281,8 @@ def surroundings_score(
     top_grade: jax.Array | float,
     ring_weight: jax.Array | float,
     overhead_weight: jax.Array | float,
+    recess_share: jax.Array | float,
+    upright_worth: jax.Array | float,
 ) -> jax.Array:
     """The part of the score that the points in and round the box decide.
 
@@ -272,6 +299,8 @@ def surroundings_score(
       top_grade: how much higher than the highest return the top may be, m per m of range.
       ring_weight: exp(-weight ring / inside).
       overhead_weight: exp(-weight above / inside).
+      recess_share: full worth from this share of the upper points behind the faces on.
+      upright_worth: worth where there is none; boxes with few upper points have full worth.
 
     Returns:
       (P,) float32 in [0, 1]; 0 where a gate fails.
@@ -283,6 +312,9 @@ def surroundings_score(
         around.num_inside, 1
     )
     score = bell(top, height_m, height_tolerance_m, height_tolerance_m) * jnp.exp(-clutter)
+    recessed = around.num_recessed / jnp.maximum(around.num_upper, 1)
+    worth = upright_worth + (1 - upright_worth) * jnp.minimum(recessed / recess_share, 1)
+    score = score * jnp.where(around.num_upper >= MIN_UPPER_POINTS, worth, 1)
     return jnp.where(plausible, score, 0)
 
 

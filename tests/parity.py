@@ -150,15 +150,17 @@ class Case:
 
 
 def complete(proposal, angle, prior, evidence, mode="evidence"):
+    readings = [
+        reference.Reading(proposal.extents[a], a * np.pi / 2 / len(proposal.curve), float(proposal.curve[a]))
+        for a in np.atleast_1d(angle)
+    ]
     return reference.complete_box(
         proposal.xy,
-        proposal.extents[angle],
-        angle=angle * np.pi / 2 / len(proposal.curve),
-        criterion_value=float(proposal.curve[angle]),
+        readings,
         evidence=evidence,
         mode=mode,
         **select_options(prior, "length_m", "width_m", "max_length_m", "max_width_m"),
-        **all_options(CONFIG.completion, "mode", "num_final_rays"),
+        **all_options(CONFIG.completion, "mode", "num_final_rays", "along_scene"),
     )
 
 

@@ -16,7 +16,7 @@ ROOT = pathlib.Path(jaxbox.__file__).parent
 PROJECT = ROOT.parent
 
 # Each layer may import those before it; the stages, the middle layer, never each other.
-FOUNDATION = {"version", "types", "capacities", "config", "settings", "masked", "geometry"}
+FOUNDATION = {"version", "types", "capacities", "class_priors", "config", "settings", "masked", "geometry"}
 STAGES = {
     "filtering", "ground", "clustering", "hull", "box", "descriptors", "evidence", "completion", "vehicles",
     "projection",
@@ -26,7 +26,7 @@ TOOLS = {"io", "evaluation", "viz"}
 ALLOWED = {
     **dict.fromkeys(STAGES, FOUNDATION),
     **dict.fromkeys(WIRING, FOUNDATION | STAGES | WIRING),
-    "reference": {"version", "types", "config", "masked"},
+    "reference": {"version", "types", "class_priors", "config", "masked"},
     "synthetic": FOUNDATION | {"projection"},
     **dict.fromkeys(TOOLS, FOUNDATION | STAGES | WIRING | TOOLS),
     "tuning": FOUNDATION | WIRING | TOOLS,

@@ -14,7 +14,12 @@ from jaxbox.types import NOT_A_BOX, Boxes, Rectangles
 
 EVIDENCE = parity.all_options(parity.CONFIG.evidence, "enabled")
 RANGE_CELL_M = parity.CONFIG.evidence.range_cell_m
-COMPLETION = parity.all_options(parity.CONFIG.completion, "mode", "num_rays", "num_final_rays")
+SIDES = parity.select_options(
+    parity.CONFIG.completion, "seen_length", "seen_width", "seen_weight", "length_margin_m", "width_margin_m"
+)
+COMPLETION = parity.all_options(
+    parity.CONFIG.completion, "mode", "num_rays", "num_final_rays", "along_scene", *SIDES
+)
 NUM_RAYS = parity.CONFIG.completion.num_rays
 SIZES = ("length_m", "width_m")
 LIMITS = ("max_length_m", "max_width_m")
@@ -33,16 +38,23 @@ def cast_rays(seen, boxes):
 
 
 @jax.jit
-def complete(rectangles, points, count, seen, prior):
-    """As the wiring does: hypotheses, their rays and their points, and the choice."""
-    boxes = completion.box_hypotheses(rectangles, **prior)
+def complete(readings, points, count, seen, prior):
+    """As the wiring does: hypotheses of each reading, their rays and their points, and the choice."""
+    limits, sizes = {name: prior[name] for name in LIMITS}, [prior[name] for name in SIZES]
+
+    def hypotheses(complete_sizes):
+        boxes = [completion.box_hypotheses(r, complete_sizes(r, *sizes), **limits) for r in readings]
+        return jax.tree.map(lambda *of_each: jnp.concatenate(of_each, axis=1), *boxes)
+
+    boxes = hypotheses(completion.usual_sizes)
     rays = evidence.cast_rays(
         seen, boxes.center, boxes.length, boxes.width, boxes.yaw, num_rays=NUM_RAYS, range_cell_m=RANGE_CELL_M
     )
     inside, near = completion.point_agreement(boxes, points, count)
     return completion.choose_hypothesis(
         boxes,
-        rectangles.worth,
+        hypotheses(functools.partial(completion.likely_sizes, **SIDES)),
+        jnp.repeat(jnp.stack([r.worth for r in readings], axis=1), 6, axis=1),
         hit=rays.hit,
         free=rays.free,
         free_length=rays.free_length,
@@ -135,14 +147,17 @@ def test_completed_boxes_are_those_of_the_reference(cases, number):
     rng = np.random.default_rng(number)
     pairs = []
     for case in cases:
-        # The best rotation for cars; any for vans, so that bad rectangles are completed alike too.
+        # The best rotation for cars; any for vans, so that bad rectangles are completed alike too. And a
+        # second reading of each, at any rotation.
         angles = [int(np.argmax(p.curve)) if number == 0 else rng.integers(90) for p in case.proposals]
+        others = list(rng.integers(90, size=len(angles)))
         expected = [
-            parity.complete(p, a, vehicle, case.evidence) for p, a in zip(case.proposals, angles, strict=True)
+            parity.complete(p, pair, vehicle, case.evidence)
+            for p, *pair in zip(case.proposals, angles, others, strict=True)
         ]
         points, count = parity.padded_points([case])
         boxes = complete(
-            rectangles_of(case.proposals, angles),
+            [rectangles_of(case.proposals, angles), rectangles_of(case.proposals, others)],
             parity.pad(points, parity.MAX_CLUSTERS),
             parity.pad(count, parity.MAX_CLUSTERS),
             case.evidence_as_input(),
@@ -164,10 +179,14 @@ def test_completed_boxes_are_those_of_the_reference(cases, number):
 def test_boxes_without_evidence_are_those_of_the_reference(cases, mode):
     vehicle = parity.CONFIG.vehicles.classes[0]
     if mode == "none":
-        stage, prior = completion.keep_measured, prior_of(vehicle, *LIMITS)
+        stage = functools.partial(completion.keep_measured, **prior_of(vehicle, *LIMITS))
     else:
-        stage, prior = completion.extend_away, prior_of(vehicle, *SIZES, *LIMITS)
-    stage = jax.jit(functools.partial(stage, **prior))
+
+        def stage(rectangles):
+            sizes = completion.likely_sizes(rectangles, **prior_of(vehicle, *SIZES), **SIDES)
+            return completion.extend_away(rectangles, sizes, **prior_of(vehicle, *LIMITS))
+
+    stage = jax.jit(stage)
     for case in cases:
         angles = [int(np.argmax(p.curve)) for p in case.proposals]
         expected = [

@@ -10,12 +10,17 @@ import parity
 from jaxbox import geometry, reference, vehicles
 
 SETTINGS = parity.CONFIG.vehicles
-AROUND = parity.select_options(SETTINGS, "margin_m", "ring_m")
+AROUND = parity.select_options(SETTINGS, "margin_m", "ring_m", "upper_height_m")
 SCORE = parity.select_options(
     SETTINGS,
     *("top_grade", "min_extent_m", "saturation_points", "sparseness_power", "free_scale", "ring_weight"),
     *("overhead_weight", "support_points", "objective_gate", "objective_softness"),
+    *("recess_share", "upright_worth"),
 )
+SURROUNDINGS_SCORE = {
+    name: SCORE[name]
+    for name in ("top_grade", "ring_weight", "overhead_weight", "recess_share", "upright_worth")
+}
 EVIDENCE_SCORE = {
     name: SCORE[name]
     for name in SCORE
@@ -56,10 +61,12 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
     for case in cases:
         boxes = boxes_of(case, rng)
         tops = rng.choice(class_tops, len(boxes)).astype(np.float32)
+        recess = rng.choice([-1, 0.15, 0.3], len(boxes)).astype(np.float32)
         xy, height = case.obstacles.xyz[:, :2].astype(np.float32), case.obstacles.height.astype(np.float32)
         around = count_points_around(
             parity.pad(boxes, MAX_BOXES),
             parity.pad(tops, MAX_BOXES),
+            parity.pad(recess, MAX_BOXES),
             len(boxes),
             parity.pad(xy, parity.MAX_OBSTACLES),
             parity.pad(height, parity.MAX_OBSTACLES),
@@ -68,12 +75,27 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
         )
         around = parity.on_host(around)
         wrong, seen = 0, 0
-        for row, (box, top) in enumerate(zip(boxes.astype(float), tops.astype(float), strict=True)):
+        for row, box in enumerate(boxes.astype(float)):
             expected = reference.count_points_around(
-                box, case.obstacles.xyz, case.obstacles.height, **AROUND, **limits, count_max_height_m=top
+                box,
+                case.obstacles.xyz,
+                case.obstacles.height,
+                **AROUND,
+                **limits,
+                count_max_height_m=float(tops[row]),
+                recess_m=float(recess[row]),
             )
-            theirs = np.array([expected.inside, expected.overhead, expected.ring])
-            ours = np.array([around.num_inside[row], around.num_above[row], around.num_ring[row]])
+            theirs = np.array(
+                [expected.inside, expected.overhead, expected.ring, expected.upper, expected.recessed]
+            )
+            counts = (
+                around.num_inside,
+                around.num_above,
+                around.num_ring,
+                around.num_upper,
+                around.num_recessed,
+            )
+            ours = np.array([count[row] for count in counts])
             wrong, seen = wrong + np.abs(ours - theirs).sum(), seen + theirs.sum()
             assert around.top[row] == np.float32(expected.top_m) or np.any(ours != theirs)
         # A point on the edge of a box may round to either side of it.
@@ -97,7 +119,7 @@ def score_boxes(columns, prior):
         around,
         columns["rho"],
         **{name: prior[name] for name in HEIGHTS},
-        **{name: SCORE[name] for name in ("top_grade", "ring_weight", "overhead_weight")},
+        **SURROUNDINGS_SCORE,
     )
     return early * sizes * late * prior["prior_weight"]
 
@@ -121,20 +143,22 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
             prior["height_m"] + rng.normal(0, 0.5, MAX_BOXES),
             rng.integers(0, 20, MAX_BOXES),
             rng.integers(0, 20, MAX_BOXES),
+            upper := rng.integers(0, 20, MAX_BOXES),
+            rng.integers(0, upper + 1),
         ],
     }
     columns, prior = jax.tree.map(np.float32, (columns, prior))
     scores = np.asarray(score_boxes(columns, prior))
     expected = []
     for row in range(MAX_BOXES):
-        inside, top, above, ring = (float(value[row]) for value in columns["around"])
+        around = (float(value[row]) for value in columns["around"])
         one = {name: float(columns[name][row]) for name in ("objective", "hit", "free_length", "support")}
         length, width = float(columns["length"][row]), float(columns["width"][row])
         expected.append(
             reference.score_box(
                 np.array([columns["rho"][row], 0.0, length, width, 0.0]),
                 SETTINGS.classes[label[row]],
-                around=reference.PointsAround(inside, top, above, ring),
+                around=reference.PointsAround(*around),
                 measured_length_m=length,
                 measured_width_m=width,
                 num_members=int(columns["num_points"][row]),

@@ -24,9 +24,11 @@ from jaxbox.reference.clusters import (
 )
 from jaxbox.reference.completion import (
     CompletedBox,
+    Reading,
     complete_box,
     complete_extent,
     direction_preference,
+    likely_size,
     point_agreement,
     scene_direction,
 )
@@ -56,6 +58,7 @@ from jaxbox.reference.vehicles import (
     PointsAround,
     bev_iou,
     count_points_around,
+    depth_behind_faces,
     distance_outside,
     score_box,
     suppress,
@@ -67,6 +70,7 @@ __all__ = [
     "CompletedBox",
     "Evidence",
     "PointsAround",
+    "Reading",
     "ReferenceDetections",
     "ShapeDescriptors",
     "azimuth_cell",
@@ -79,6 +83,7 @@ __all__ = [
     "convex_hull",
     "count_points_around",
     "criterion_curve",
+    "depth_behind_faces",
     "detect",
     "direction_preference",
     "distance_outside",
@@ -94,6 +99,7 @@ __all__ = [
     "height_above_ground",
     "keep_clusters",
     "label_components",
+    "likely_size",
     "min_area_rectangle",
     "plane_elevation",
     "point_agreement",

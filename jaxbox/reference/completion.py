@@ -22,6 +22,22 @@ KEEP_NEAR, KEEP_FAR, KEEP_CENTRE = 0, 1, 2
 """What stays where it was measured when an extent is completed."""
 
 
+SEEN_RAMP = 0.05
+"""Share of the usual size over which a side goes from partly hidden to seen whole."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Reading:
+    """A cluster's rectangle at one rotation."""
+
+    extents: np.ndarray
+    """(4,) m: smallest and largest u, smallest and largest v (see `criterion_curve`)."""
+    angle: float
+    """rad, of the u axis."""
+    value: float
+    """Criterion of the rectangle, with the preference for the scene's direction."""
+
+
 @dataclasses.dataclass(frozen=True)
 class CompletedBox:
     """A rectangle in the bird's-eye view, its hidden sides completed."""
@@ -34,6 +50,30 @@ class CompletedBox:
     """Extent of the fitted points along the box."""
     measured_width_m: float
     """Extent of the fitted points across the box."""
+
+
+def likely_size(
+    measured_m: float, usual_m: float, *, margin_m: float, seen: float, seen_weight: float
+) -> float:
+    """The usual size of a side that may be hidden in part; between it and the measured for the others.
+
+    Args:
+      measured_m: extent of the fitted points.
+      usual_m: of the class.
+      margin_m: measured sides read short by this.
+      seen: share of the usual size from which a side may be seen whole.
+      seen_weight: what the measured size of such a side weighs.
+
+    Returns:
+      m, at least as measured.
+
+    >>> likely_size(1.0, 4.0, margin_m=0.2, seen=0.7, seen_weight=0.5)
+    4.0
+    >>> likely_size(3.0, 4.0, margin_m=0.2, seen=0.7, seen_weight=0.5)
+    3.6
+    """
+    whole = np.clip((measured_m / usual_m - seen) / SEEN_RAMP, 0, 1)
+    return float(max(usual_m + seen_weight * whole * (measured_m + margin_m - usual_m), measured_m))
 
 
 def complete_extent(low: float, high: float, prior_m: float, keep: int) -> tuple[float, float]:
@@ -62,10 +102,8 @@ def complete_extent(low: float, high: float, prior_m: float, keep: int) -> tuple
 
 def complete_box(
     xy: np.ndarray,
-    extents: np.ndarray,
+    rectangles: list[Reading],
     *,
-    angle: float,
-    criterion_value: float,
     evidence: Evidence | None,
     mode: str,
     length_m: float,
@@ -79,20 +117,25 @@ def complete_box(
     near_weight: float,
     closeness_weight: float,
     not_away_cost: float,
+    seen_length: float,
+    seen_width: float,
+    seen_weight: float,
+    length_margin_m: float,
+    width_margin_m: float,
 ) -> CompletedBox | None:
-    """Completes the rectangle round a cluster to the size of a vehicle class.
+    """Completes a rectangle round a cluster to the size of a vehicle class.
 
-    "evidence" tries each axis as the length, extended away from the sensor, with the width extended
-    away from it, towards it, or to both sides, and takes the largest objective
+    "evidence" tries each axis of each rectangle as the length, extended away from the sensor, with the
+    width extended away from it, towards it, or to both sides, and takes the largest objective
     J = hit - free_weight free - free_length_weight free_length + inside_weight inside
     + near_weight near + closeness_weight criterion - (not_away_cost unless the width extends away).
-    "away" takes the longer extent as the length and extends both away; "none" changes nothing.
+    Boxes are judged at the class's size, and answered at their likely size (see `likely_size`).
+    "away" takes the longer extent of the first rectangle as the length and extends both away; "none"
+    changes nothing.
 
     Args:
       xy: (n, 2) m, sensor frame: the fitted points.
-      extents: (4,) m: smallest and largest u, smallest and largest v (see `criterion_curve`).
-      angle: rad, of the u axis.
-      criterion_value: of the rectangle, with the preference for the scene's direction.
+      rectangles: of the cluster, at one rotation or more.
       evidence: of the sweep, or None.
       mode: "none", "away" or "evidence".
       length_m: of the class.
@@ -106,47 +149,84 @@ def complete_box(
       near_weight: see above.
       closeness_weight: see above.
       not_away_cost: see above.
+      seen_length: see `likely_size`.
+      seen_width: see there.
+      seen_weight: see there.
+      length_margin_m: see there.
+      width_margin_m: see there.
 
     Returns:
       The box, or None where the measured extents are too large for the class.
     """
-    u0, u1, v0, v1 = extents
-    # Turning the axes by a quarter turn takes (u, v) to (v, -u).
-    readings = [(u0, u1, v0, v1, angle), (v0, v1, -u1, -u0, angle + np.pi / 2)]
+    ways = [way for rectangle in rectangles for way in _ways(rectangle)]
     if mode != "evidence":
-        readings = readings[:1] if u1 - u0 >= v1 - v0 else readings[1:]
-    readings = [r for r in readings if r[1] - r[0] <= max_length_m and r[3] - r[2] <= max_width_m]
-    if not readings:
+        ways = ways[:1] if ways[0].length >= ways[0].width else ways[1:2]
+    ways = [way for way in ways if way.length <= max_length_m and way.width <= max_width_m]
+    if not ways:
         return None
-    if mode != "evidence":
-        prior = (0.0, 0.0) if mode == "none" else (length_m, width_m)
-        box = _place(readings[0], *prior, KEEP_NEAR)
-        return _completed(readings[0], box, NEUTRAL_OBJECTIVE)
-    trials = [(reading, keep) for reading in readings for keep in (KEEP_NEAR, KEEP_FAR, KEEP_CENTRE)]
-    boxes = np.array([_place(reading, length_m, width_m, keep) for reading, keep in trials])
+    if mode == "none":
+        return _completed(ways[0], _place(ways[0], 0.0, 0.0, KEEP_NEAR), NEUTRAL_OBJECTIVE)
+
+    def answer(way: _Way, keep: int, objective: float) -> CompletedBox:
+        length = likely_size(
+            way.length, length_m, margin_m=length_margin_m, seen=seen_length, seen_weight=seen_weight
+        )
+        width = likely_size(
+            way.width, width_m, margin_m=width_margin_m, seen=seen_width, seen_weight=seen_weight
+        )
+        return _completed(way, _place(way, length, width, keep), objective)
+
+    if mode == "away":
+        return answer(ways[0], KEEP_NEAR, NEUTRAL_OBJECTIVE)
+    trials = [(way, keep) for way in ways for keep in (KEEP_NEAR, KEEP_FAR, KEEP_CENTRE)]
+    boxes = np.array([_place(way, length_m, width_m, keep) for way, keep in trials])
     rays = box_evidence(boxes, evidence, num_rays=num_rays)
     inside, near = point_agreement(boxes, xy)
     objective = rays.hit - free_weight * rays.free - free_length_weight * rays.free_length
-    objective += inside_weight * inside + near_weight * near + closeness_weight * criterion_value
+    objective += inside_weight * inside + near_weight * near
+    objective += closeness_weight * np.array([way.value for way, _ in trials])
     objective -= not_away_cost * np.array([keep != KEEP_NEAR for _, keep in trials])
     best = int(np.argmax(objective))
-    return _completed(trials[best][0], boxes[best], float(objective[best]))
+    return answer(*trials[best], float(objective[best]))
 
 
-def _place(
-    reading: tuple[float, float, float, float, float], length_m: float, width_m: float, keep_width: int
-) -> np.ndarray:
-    """(5,) box of a reading (interval along, interval across, yaw) grown to a size."""
-    along, length = complete_extent(reading[0], reading[1], length_m, KEEP_NEAR)
-    across, width = complete_extent(reading[2], reading[3], width_m, keep_width)
-    cos, sin = np.cos(reading[4]), np.sin(reading[4])
-    return np.array([cos * along - sin * across, sin * along + cos * across, length, width, reading[4]])
+@dataclasses.dataclass(frozen=True)
+class _Way:
+    """A rectangle with one of its axes as the length."""
+
+    along: tuple[float, float]
+    across: tuple[float, float]
+    yaw: float
+    value: float
+
+    @property
+    def length(self) -> float:
+        return self.along[1] - self.along[0]
+
+    @property
+    def width(self) -> float:
+        return self.across[1] - self.across[0]
 
 
-def _completed(
-    reading: tuple[float, float, float, float, float], box: np.ndarray, objective: float
-) -> CompletedBox:
-    return CompletedBox(box, objective, reading[1] - reading[0], reading[3] - reading[2])
+def _ways(rectangle: Reading) -> list[_Way]:
+    u0, u1, v0, v1 = rectangle.extents
+    # Turning the axes by a quarter turn takes (u, v) to (v, -u).
+    return [
+        _Way((u0, u1), (v0, v1), rectangle.angle, rectangle.value),
+        _Way((v0, v1), (-u1, -u0), rectangle.angle + np.pi / 2, rectangle.value),
+    ]
+
+
+def _place(way: _Way, length_m: float, width_m: float, keep_width: int) -> np.ndarray:
+    """(5,) box grown to a size."""
+    along, length = complete_extent(*way.along, length_m, KEEP_NEAR)
+    across, width = complete_extent(*way.across, width_m, keep_width)
+    cos, sin = np.cos(way.yaw), np.sin(way.yaw)
+    return np.array([cos * along - sin * across, sin * along + cos * across, length, width, way.yaw])
+
+
+def _completed(way: _Way, box: np.ndarray, objective: float) -> CompletedBox:
+    return CompletedBox(box, objective, way.length, way.width)
 
 
 def point_agreement(boxes: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

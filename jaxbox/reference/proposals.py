@@ -6,13 +6,25 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from jaxbox.config import ClassPrior, ComponentMap
+from jaxbox.class_priors import ClassPrior
+from jaxbox.config import ComponentMap
 from jaxbox.reference.boxes import convex_hull, criterion_curve, fit_points
 from jaxbox.reference.clusters import NO_CLUSTER, grid_cells, keep_clusters, label_components, warp_range
-from jaxbox.reference.completion import CompletedBox, complete_box, direction_preference, scene_direction
+from jaxbox.reference.completion import (
+    CompletedBox,
+    Reading,
+    complete_box,
+    direction_preference,
+    scene_direction,
+)
 from jaxbox.reference.evidence import Evidence, box_evidence, support_at
 from jaxbox.reference.vehicles import PointsAround, count_points_around, score_box
 from jaxbox.types import Label
+
+INSISTENCE = 5.0
+"""How often the scene's direction counts where the second rectangle's rotation is chosen."""
+LOWER_PART_M = 0.5
+"""A cluster may be so much lower than its vehicle."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,18 +187,26 @@ def is_large(proposal: Proposal, settings: Any) -> bool:
     return stands and enough and proposal.top_m > vehicles.large_height_m
 
 
+def _reading(proposal: Proposal, preference: np.ndarray, insistence: float = 1.0) -> Reading:
+    """The rectangle at the best rotation, where the preference counts `insistence` times."""
+    best = int(np.argmax(proposal.curve + insistence * preference))
+    value = float(proposal.curve[best] + preference[best])
+    return Reading(proposal.extents[best], best * np.pi / 2 / len(preference), value)
+
+
 def _complete(
-    proposal: Proposal, preference: np.ndarray, prior: ClassPrior, evidence: Evidence | None, settings: Any
+    proposal: Proposal,
+    readings: list[Reading],
+    prior: ClassPrior,
+    evidence: Evidence | None,
+    settings: Any,
 ) -> CompletedBox | None:
-    value = proposal.curve + preference
-    best = int(np.argmax(value))
     names = ("mode", "num_rays", "free_weight", "free_length_weight", "inside_weight", "near_weight")
-    names += ("closeness_weight", "not_away_cost")
+    names += ("closeness_weight", "not_away_cost", "seen_length", "seen_width", "seen_weight")
+    names += ("length_margin_m", "width_margin_m")
     return complete_box(
         proposal.xy,
-        proposal.extents[best],
-        angle=best * np.pi / 2 / len(value),
-        criterion_value=float(value[best]),
+        readings,
         evidence=evidence,
         **select_options(prior, "length_m", "width_m", "max_length_m", "max_width_m"),
         **select_options(settings.completion, *names),
@@ -198,7 +218,9 @@ def _preference(proposals: list[Proposal], evidence: Evidence | None, settings: 
     box, car = settings.box, settings.vehicles.classes[Label.CAR]
     none = np.zeros(box.num_angles)
     fits = (
-        [(p, _complete(p, none, car, evidence, settings)) for p in proposals] if box.scene_direction else []
+        [(p, _complete(p, [_reading(p, none)], car, evidence, settings)) for p in proposals]
+        if box.scene_direction
+        else []
     )
     fits = [(p, fit) for p, fit in fits if fit is not None]
     if not fits:
@@ -236,13 +258,19 @@ def judge_candidates(
     """
     vehicles = settings.vehicles
     preference = _preference(proposals[0], evidence, settings)
+    along_scene = settings.box.scene_direction and settings.completion.along_scene
     every = [proposal for of_map in proposals for proposal in of_map]
     large = [p for p in every if is_large(p, settings)][: vehicles.max_large]
     candidates = []
     for label, chosen in ((Label.CAR, every), (Label.VAN, large), (Label.TRUCK, large)):
         prior = vehicles.classes[label]
         for proposal in chosen:
-            completed = _complete(proposal, preference, prior, evidence, settings)
+            readings = [_reading(proposal, preference)]
+            if not _is_tall(proposal, readings[0], settings):
+                continue
+            if along_scene:
+                readings.append(_reading(proposal, preference, INSISTENCE))
+            completed = _complete(proposal, readings, prior, evidence, settings)
             if completed is not None:
                 judged = _judge(
                     proposal, completed, label, obstacles=obstacles, evidence=evidence, settings=settings
@@ -250,6 +278,14 @@ def judge_candidates(
                 candidates.append(judged)
     candidates = [c for c in candidates if c.score > vehicles.min_score]
     return sorted(candidates, key=lambda c: -c.score)
+
+
+def _is_tall(proposal: Proposal, reading: Reading, settings: Any) -> bool:
+    """Whether a cluster can be (the lower part of) a vehicle of the lowest class."""
+    u0, u1, v0, v1 = reading.extents
+    allowance = settings.vehicles.top_grade * np.hypot((u0 + u1) / 2, (v0 + v1) / 2)
+    lowest = min(prior.min_height_m for prior in settings.vehicles.classes)
+    return proposal.top_m + allowance > lowest - LOWER_PART_M
 
 
 def _judge(
@@ -269,9 +305,10 @@ def _judge(
         box,
         obstacles.xyz[near],
         obstacles.height[near],
-        **select_options(vehicles, "margin_m", "ring_m"),
+        **select_options(vehicles, "margin_m", "ring_m", "upper_height_m"),
         **select_options(settings.ground, "min_height_m", "max_height_m"),
         count_max_height_m=prior.count_max_height_m,
+        recess_m=prior.recess_m,
     )
     rays = box_evidence(box[None], evidence, num_rays=settings.completion.num_final_rays)
     names = (
@@ -283,6 +320,7 @@ def _judge(
         "ring_weight",
     )
     names += ("overhead_weight", "support_points", "objective_gate", "objective_softness")
+    names += ("recess_share", "upright_worth")
     score = score_box(
         box,
         prior,

@@ -6,7 +6,10 @@ import cv2
 import numpy as np
 from scipy.special import expit
 
-from jaxbox.config import ClassPrior
+from jaxbox.class_priors import ClassPrior
+
+MIN_UPPER_POINTS = 3
+"""Fewer upper points say nothing about whether they lie behind the faces."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,6 +24,10 @@ class PointsAround:
     """Higher points within the box and its margin."""
     ring: int
     """Points of the vehicle's heights in the ring round the margin."""
+    upper: int = 0
+    """Points inside as high as glass, bonnet and roof."""
+    recessed: int = 0
+    """Those of them behind the faces that the sensor sees."""
 
 
 def distance_outside(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
@@ -50,6 +57,8 @@ def count_points_around(
     min_height_m: float,
     count_max_height_m: float,
     max_height_m: float,
+    recess_m: float,
+    upper_height_m: float,
 ) -> PointsAround:
     """Counts the points in and round a box.
 
@@ -62,6 +71,8 @@ def count_points_around(
       min_height_m: lower points are ground.
       count_max_height_m: points from this on are overhead,
       max_height_m: and from this on they are left out.
+      recess_m: recessed points lie farther than this behind each face that the sensor sees.
+      upper_height_m: points higher than this are glass, bonnet and roof.
 
     Returns:
       The counts.
@@ -70,12 +81,35 @@ def count_points_around(
     within = outside < margin_m
     counted = (height > min_height_m) & (height < count_max_height_m)
     above = (height >= count_max_height_m) & (height < max_height_m)
+    upper = within & counted & (height > upper_height_m)
     return PointsAround(
         inside=int((within & counted).sum()),
         top_m=float(np.max(height, where=within & counted, initial=0.0)),
         overhead=int((within & above).sum()),
         ring=int((~within & (outside < ring_m) & counted).sum()),
+        upper=int(upper.sum()),
+        recessed=int((upper & (depth_behind_faces(xyz[:, :2], box) > recess_m)).sum()),
     )
+
+
+def depth_behind_faces(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """How far points lie behind the nearest face that a sensor at the origin sees; negative in front.
+
+    Args:
+      xy: (n, 2) m.
+      box: (5,): x, y, length, width in m and yaw in rad.
+
+    Returns:
+      (n,) m; infinite where the sensor is inside the box.
+    """
+    x, y, length, width, yaw = box
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    local, sensor = (xy - [x, y]) @ turn, np.array([-x, -y]) @ turn
+    depth = np.full(len(xy), np.inf)
+    for axis, half in enumerate((length / 2, width / 2)):
+        if abs(sensor[axis]) > half:
+            depth = np.minimum(depth, half - np.sign(sensor[axis]) * local[:, axis])
+    return depth
 
 
 def score_box(
@@ -100,6 +134,8 @@ def score_box(
     support_points: float,
     objective_gate: float,
     objective_softness: float,
+    recess_share: float,
+    upright_worth: float,
 ) -> float:
     """How much a box looks like a vehicle of a class: a product of factors in [0, 1].
 
@@ -124,6 +160,8 @@ def score_box(
       support_points: factor min(1, (support + 1/2) / this).
       objective_gate: factor 1 / (1 + exp(-(J - gate) / softness)).
       objective_softness: see there.
+      recess_share: factor from `upright_worth`, where no upper point is recessed, to 1 from this share on.
+      upright_worth: see there.
 
     Returns:
       The score; 0 where a gate of the class closes.
@@ -142,6 +180,9 @@ def score_box(
     score *= hit * np.exp(-((free_length / free_scale) ** 2))
     clutter = ring_weight * around.ring + overhead_weight * around.overhead
     score *= np.exp(-clutter / max(around.inside, 1))
+    if around.upper >= MIN_UPPER_POINTS:
+        recessed = min(1.0, around.recessed / around.upper / recess_share)
+        score *= upright_worth + (1 - upright_worth) * recessed
     if support is not None:
         score *= min(1.0, (support + 0.5) / support_points)
     return float(score * expit((objective - objective_gate) / objective_softness))

@@ -2,17 +2,22 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxbox import box, completion, evidence, hull
-from jaxbox.config import DetectorConfig
+from jaxbox.config import CompletionConfig, DetectorConfig
 from jaxbox.masked import compact, map_rows, take
 from jaxbox.steps.common import class_values, stage_options
 from jaxbox.steps.points import Heights, Obstacles, Sweep
-from jaxbox.steps.proposals import Proposals, Trials, list_trials
+from jaxbox.steps.proposals import Proposals, Trials, list_trials, longest_side
 from jaxbox.types import NOT_A_BOX, Boxes, Rectangles
+
+INSISTENCE = 5.0
+"""How often the scene's direction counts for the second reading of a cluster: it bends a closeness only."""
 
 PROPOSAL_CHUNK = 512
 """Proposals held against the evidence at a time: a loop over their points has few, wide steps."""
@@ -109,12 +114,14 @@ def complete_boxes(
     fits: Fits, proposals: Proposals, seen: evidence.Evidence | None, config: DetectorConfig
 ) -> tuple[Trials, Boxes]:
     """The completed box of every trial, with the scene's direction preferred where the preset asks."""
-    trials = list_trials(proposals)
     preference = jnp.zeros(config.box.num_angles)
     if config.box.scene_direction and seen is not None:
         preference = _scene_preference(fits, proposals, seen, config)
-    rectangles = box.best_rectangles(fits.curve, fits.extents, preference)
-    return trials, _complete(trials, rectangles, fits, seen, config)
+    readings = [box.best_rectangles(fits.curve, fits.extents, preference)]
+    if config.box.scene_direction and config.completion.along_scene:
+        readings.append(box.best_rectangles(fits.curve, fits.extents, preference, insistence=INSISTENCE))
+    trials = list_trials(proposals, readings, config)
+    return trials, _complete(trials, readings, fits, seen, config)
 
 
 def _scene_preference(
@@ -124,21 +131,17 @@ def _scene_preference(
     settings = config.box
     size = proposals.maps[0].num_points.shape[0]
     first = jax.tree.map(lambda a: a[:size] if a.ndim else a, fits)
-    j = jnp.arange(size)
-    trials = Trials(
-        jnp.where(j < proposals.num_first, j, size), jnp.zeros(size, jnp.int32), proposals.num_first
-    )
     rectangles = box.best_rectangles(first.curve, first.extents, jnp.zeros(settings.num_angles))
-    boxes = _complete(trials, rectangles, first, seen, config)
-    rays = cast_rays(boxes, trials.num, seen, config)
-    extent = jnp.max(boxes.measured, axis=1)
-    voting = (j < trials.num) & (boxes.objective > NOT_A_BOX)
-    voting = voting & (extent >= settings.direction_min_extent_m)
+    long = longest_side(rectangles) >= settings.direction_min_extent_m
+    cluster, num = compact(long & (jnp.arange(size) < proposals.num_first), size)
+    boxes = _complete(Trials(cluster, jnp.zeros_like(cluster), num), [rectangles], first, seen, config)
+    rays = cast_rays(boxes, num, seen, config)
+    voting = (jnp.arange(size) < num) & (boxes.objective > NOT_A_BOX)
     voting = voting & (rays.free_length <= settings.direction_max_free)
     return box.scene_preference(
         boxes.yaw,
-        extent,
-        proposals.num_points[:size],
+        jnp.max(boxes.measured, axis=1),
+        take(proposals.num_points, cluster),
         voting,
         num_angles=settings.num_angles,
         weight=settings.direction_weight,
@@ -148,40 +151,62 @@ def _scene_preference(
 
 def _complete(
     trials: Trials,
-    rectangles: Rectangles,
+    readings: Sequence[Rectangles],
     fits: Fits,
     seen: evidence.Evidence | None,
     config: DetectorConfig,
 ) -> Boxes:
     settings = config.completion
-    limits = ("max_length_m", "max_width_m")
-    prior = {name: class_values(config, name, trials.label) for name in ("length_m", "width_m", *limits)}
+    limits = {name: class_values(config, name, trials.label) for name in ("max_length_m", "max_width_m")}
+    usual = tuple(class_values(config, name, trials.label) for name in ("length_m", "width_m"))
 
-    def complete(rows: tuple[jax.Array, dict[str, jax.Array]]) -> Boxes:
-        cluster, prior = rows
-        rectangle = jax.tree.map(lambda a: take(a, cluster), rectangles)
+    def complete(rows: tuple[jax.Array, dict[str, jax.Array], tuple[jax.Array, jax.Array]]) -> Boxes:
+        cluster, limits, usual = rows
+        each = [jax.tree.map(lambda a: take(a, cluster), rectangles) for rectangles in readings]
         if settings.mode == "none":
-            return completion.keep_measured(rectangle, **{name: prior[name] for name in limits})
-        if settings.mode == "away":
-            return completion.extend_away(rectangle, **prior)
-        assert seen is not None  # see check_settings
-        hypotheses = completion.box_hypotheses(rectangle, **prior)
-        rays = _cast_chunk(hypotheses, settings.num_rays, seen, config)
-        inside, near = completion.point_agreement(
-            hypotheses, take(fits.points, cluster), take(fits.count, cluster)
+            return completion.keep_measured(each[0], **limits)
+        likely = functools.partial(
+            completion.likely_sizes, length_m=usual[0], width_m=usual[1], **_fields(settings, _SIDE_FIELDS)
         )
+        if settings.mode == "away":
+            return completion.extend_away(each[0], likely(each[0]), **limits)
+        assert seen is not None  # see check_settings
+        judged = _hypotheses(each, [completion.usual_sizes(r, *usual) for r in each], limits)
+        answers = _hypotheses(each, [likely(r) for r in each], limits)
+        rays = _cast_chunk(judged, settings.num_rays, seen, config)
+        points, count = take(fits.points, cluster), take(fits.count, cluster)
+        inside, near = completion.point_agreement(judged, points, count)
         return completion.choose_hypothesis(
-            hypotheses,
-            rectangle.worth,
+            judged,
+            answers,
+            jnp.repeat(jnp.stack([r.worth for r in each], axis=1), judged.yaw.shape[1] // len(each), axis=1),
             hit=rays.hit,
             free=rays.free,
             free_length=rays.free_length,
             inside=inside,
             near=near,
-            **stage_options(settings, "mode", "num_rays", "num_final_rays"),
+            **_fields(settings, _OBJECTIVE_FIELDS),
         )
 
-    return map_rows(complete, (trials.cluster, prior), num_rows=trials.num, chunk=PROPOSAL_CHUNK)
+    return map_rows(complete, (trials.cluster, limits, usual), num_rows=trials.num, chunk=PROPOSAL_CHUNK)
+
+
+_SIDE_FIELDS = ("seen_length", "seen_width", "seen_weight", "length_margin_m", "width_margin_m")
+_OBJECTIVE_FIELDS = (
+    "free_weight", "free_length_weight", "inside_weight", "near_weight", "closeness_weight", "not_away_cost",
+)  # fmt: skip
+
+
+def _fields(settings: CompletionConfig, names: Sequence[str]) -> dict[str, Any]:
+    return {name: getattr(settings, name) for name in names}
+
+
+def _hypotheses(
+    readings: Sequence[Rectangles], sizes: Sequence[jax.Array], limits: dict[str, jax.Array]
+) -> Boxes:
+    """(P, S) the hypotheses of all readings of each cluster, side by side."""
+    boxes = [completion.box_hypotheses(r, size, **limits) for r, size in zip(readings, sizes, strict=True)]
+    return jax.tree.map(lambda *of_each: jnp.concatenate(of_each, axis=1), *boxes)
 
 
 def _cast_chunk(

@@ -54,6 +54,7 @@ def score_boxes(
     around = vehicles.count_points_around(
         rectangle,
         prior("count_max_height_m"),
+        prior("recess_m"),
         num,
         obstacles.xy,
         obstacles.height,
@@ -62,6 +63,7 @@ def score_boxes(
         max_nearby=settings.max_nearby,
         margin_m=settings.margin_m,
         ring_m=settings.ring_m,
+        upper_height_m=settings.upper_height_m,
     )
     rho = jnp.linalg.norm(rectangle[:, :2], axis=1)
     late = vehicles.surroundings_score(
@@ -70,6 +72,8 @@ def score_boxes(
         top_grade=settings.top_grade,
         ring_weight=settings.ring_weight,
         overhead_weight=settings.overhead_weight,
+        recess_share=settings.recess_share,
+        upright_worth=settings.upright_worth,
         **{name: prior(name) for name in ("height_m", "height_tolerance_m", "min_height_m", "max_height_m")},
     )
     height = jnp.maximum(around.top + settings.top_margin_m, prior("min_box_height_m"))

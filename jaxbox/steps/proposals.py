@@ -1,16 +1,22 @@
 """From the points to clusters, and the classes each is tried as."""
 
 import dataclasses
+import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 
 from jaxbox import clustering
+from jaxbox.class_priors import ClassPrior
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import compact, take
+from jaxbox.masked import compact
 from jaxbox.steps.common import stage_options
 from jaxbox.steps.points import Obstacles
-from jaxbox.types import Clusters, Label
+from jaxbox.types import Clusters, Label, Rectangles
+
+LOWER_PART_M = 0.5
+"""A cluster may be so much lower than its vehicle: the rest is another cluster, or outside the map."""
 
 
 @jax.tree_util.register_dataclass
@@ -129,17 +135,44 @@ class Trials:
     num: jax.Array  # ()
 
 
-def list_trials(proposals: Proposals) -> Trials:
-    """Lists cars first, then vans, then trucks, without gaps."""
+def list_trials(proposals: Proposals, readings: Sequence[Rectangles], config: DetectorConfig) -> Trials:
+    """Lists cars first, then vans, then trucks, without gaps: those that a gate would not refuse anyway."""
     capacity, max_large = proposals.num_points.shape[0], proposals.large.shape[0]
-    num_cars, num_large = proposals.num_clusters, jnp.minimum(proposals.num_large, max_large)
-    j = jnp.arange(capacity + 2 * max_large)
-    extra = j - num_cars
-    is_car, is_van = j < num_cars, extra < num_large
-    large = take(proposals.large, jnp.where(is_van, extra, extra - num_large), capacity)
-    num = num_cars + 2 * num_large
+    row = jnp.arange(capacity)
+    present = jnp.stack([row < proposals.num_clusters, *[_is_among(proposals.large, capacity)] * 2])
+    fits = jnp.stack([_fits(prior, readings, config) for prior in config.vehicles.classes])
+    worth_trying = present & fits & _tall(proposals, readings[0], config)
+    index, num = compact(worth_trying.reshape(-1), capacity + 2 * max_large)
+    present = index < worth_trying.size
     return Trials(
-        cluster=jnp.where(j >= num, capacity, jnp.where(is_car, j, large)),
-        label=jnp.where(is_car, Label.CAR, jnp.where(is_van, Label.VAN, Label.TRUCK)),
+        cluster=jnp.where(present, index % capacity, capacity),
+        label=jnp.where(present, index // capacity, Label.CAR),
         num=num,
     )
+
+
+def _is_among(rows: jax.Array, size: int) -> jax.Array:
+    return jnp.zeros(size, bool).at[rows].set(True, mode="drop")
+
+
+def _fits(prior: ClassPrior, readings: Sequence[Rectangles], config: DetectorConfig) -> jax.Array:
+    """(P,) whether some reading of a cluster is no larger than a class, and not too small to tell."""
+    fits = jnp.zeros_like(readings[0].angle, bool)
+    for rectangles in readings:
+        long, short = longest_side(rectangles), jnp.min(rectangles.high - rectangles.low, axis=1)
+        small = (long <= prior.max_length_m) & (short <= prior.max_width_m)
+        fits = fits | (small & (long >= config.vehicles.min_extent_m))
+    return fits
+
+
+def _tall(proposals: Proposals, rectangles: Rectangles, config: DetectorConfig) -> jax.Array:
+    """(P,) whether a cluster can be (the lower part of) the lowest class, given the beams' spacing."""
+    vehicles = config.vehicles
+    rho = jnp.linalg.norm((rectangles.low + rectangles.high) / 2, axis=1)
+    lowest = functools.reduce(jnp.minimum, [prior.min_height_m for prior in vehicles.classes])
+    return proposals.max_height + vehicles.top_grade * rho > lowest - LOWER_PART_M
+
+
+def longest_side(rectangles: Rectangles) -> jax.Array:
+    """(P,) float32, m."""
+    return jnp.max(rectangles.high - rectangles.low, axis=1)
