@@ -28,8 +28,10 @@ class ClassPrior:
     """Width of the length score above the prior."""
     width_tolerance_m: Scalar
     """Width of the width score."""
-    height_tolerance_m: Scalar
-    """Width of the height score."""
+    height_below_m: Scalar
+    """Width of the height score below the prior."""
+    height_above_m: Scalar
+    """Width of the height score above the prior."""
     min_height_m: Scalar
     """Lower tops, after the range allowance, are no such vehicle."""
     max_height_m: Scalar
@@ -58,14 +60,15 @@ CAR = ClassPrior(
     length_below_m=0.8,
     length_above_m=2.0,
     width_tolerance_m=0.3,
-    height_tolerance_m=0.3,
+    height_below_m=0.3,
+    height_above_m=0.6,
     min_height_m=1.0,
     max_height_m=2.3,
     max_length_m=6.5,
     max_width_m=2.4,
     min_box_height_m=1.48,
     prior_weight=1.0,
-    count_max_height_m=2.0,
+    count_max_height_m=2.2,
     recess_m=0.3,
 )
 VAN = ClassPrior(
@@ -75,7 +78,8 @@ VAN = ClassPrior(
     length_below_m=0.8,
     length_above_m=1.5,
     width_tolerance_m=0.3,
-    height_tolerance_m=0.35,
+    height_below_m=0.35,
+    height_above_m=0.35,
     min_height_m=2.2,
     max_height_m=2.7,
     max_length_m=7.5,
@@ -92,7 +96,8 @@ TRUCK = ClassPrior(
     length_below_m=5.0,
     length_above_m=4.0,
     width_tolerance_m=0.4,
-    height_tolerance_m=0.8,
+    height_below_m=0.8,
+    height_above_m=0.8,
     min_height_m=2.4,
     max_height_m=4.2,
     max_length_m=18.0,

@@ -275,7 +275,8 @@ def surroundings_score(
     rho: jax.Array,
     *,
     height_m: jax.Array,
-    height_tolerance_m: jax.Array,
+    height_below_m: jax.Array,
+    height_above_m: jax.Array,
     min_height_m: jax.Array,
     max_height_m: jax.Array,
     top_grade: jax.Array | float,
@@ -293,7 +294,8 @@ def surroundings_score(
       around: see `count_points_around`.
       rho: (P,) float32, m, range of the box.
       height_m: (P,) float32, m, the prior.
-      height_tolerance_m: (P,) float32, m.
+      height_below_m: (P,) float32, m, width of the height's bell below the prior.
+      height_above_m: (P,) float32, m, above the prior.
       min_height_m: (P,) float32, m: lower tops are no such vehicle.
       max_height_m: (P,) float32, m: higher tops are no such vehicle.
       top_grade: how much higher than the highest return the top may be, m per m of range.
@@ -311,7 +313,7 @@ def surroundings_score(
     clutter = (ring_weight * around.num_ring + overhead_weight * around.num_above) / jnp.maximum(
         around.num_inside, 1
     )
-    score = bell(top, height_m, height_tolerance_m, height_tolerance_m) * jnp.exp(-clutter)
+    score = bell(top, height_m, height_below_m, height_above_m) * jnp.exp(-clutter)
     recessed = around.num_recessed / jnp.maximum(around.num_upper, 1)
     worth = upright_worth + (1 - upright_worth) * jnp.minimum(recessed / recess_share, 1)
     score = score * jnp.where(around.num_upper >= MIN_UPPER_POINTS, worth, 1)

@@ -17,8 +17,9 @@ CAPACITY = 2**14
 SEEDS = range(5)
 GOOD_SCORE = 0.2
 """Boxes that a user would act on; the others may come and go with the order of the points."""
-SAME_IOU, SAME_SIZE_M, SAME_YAW = 0.8, 0.15, np.radians(3)
-"""What counts as the same box: grids and samples of points fall otherwise when the sweep is turned."""
+SAME_IOU, SAME_SIZE_M, SAME_YAW = 0.8, (0.6, 0.15), np.radians(3)
+"""What counts as the same box: grids and samples of points fall otherwise when the sweep is turned, and a
+point more or less can decide whether a side was seen whole, and so its length."""
 
 iou = jax.jit(jax.vmap(jax.vmap(rectangle_iou, (None, 0)), (0, None)))
 
@@ -187,7 +188,7 @@ def assert_all_found_again(boxes, detections):
     overlap = np.asarray(iou(boxes.astype(np.float32), candidates))
     again = candidates[overlap.argmax(axis=1)]
     assert (overlap.max(axis=1) > SAME_IOU).all()
-    np.testing.assert_allclose(again[:, 2:4], boxes[:, 2:4], atol=SAME_SIZE_M)
+    assert (np.abs(again[:, 2:4] - boxes[:, 2:4]) < SAME_SIZE_M).all()
     between = (again[:, 4] - boxes[:, 4] + np.pi / 2) % np.pi - np.pi / 2
     assert (np.abs(between) < SAME_YAW).all()
 
@@ -305,7 +306,7 @@ def test_vehicles_with_many_points_are_found():
     for seed in SEEDS:
         truth = street(seed).boxes
         boxes = np.column_stack([truth.center[:, :2], truth.size[:, :2], truth.yaw])[truth.num_points >= 60]
-        overlap = np.asarray(iou(boxes.astype(np.float32), rectangles(found(seed), 0.1)))
+        overlap = np.asarray(iou(boxes.astype(np.float32), rectangles(found(seed), 0.05)))
         hits, total = hits + (overlap.max(axis=1) > 0.5).sum(), total + len(boxes)
     assert total > 20
     assert hits / total > 0.85

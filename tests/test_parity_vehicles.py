@@ -34,7 +34,7 @@ EVIDENCE_SCORE = {
         "objective_softness",
     )
 }
-HEIGHTS = ("height_m", "height_tolerance_m", "min_height_m", "max_height_m")
+HEIGHTS = ("height_m", "height_below_m", "height_above_m", "min_height_m", "max_height_m")
 MAX_BOXES = 1024
 NUM_RANDOM = 300
 

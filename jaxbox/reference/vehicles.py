@@ -175,7 +175,7 @@ def score_box(
     height = min(max(float(prior.height_m), top), top + allowance)
     score = _bell(box[2], prior.length_m, prior.length_below_m, prior.length_above_m)
     score *= _bell(box[3], prior.width_m, prior.width_tolerance_m, prior.width_tolerance_m)
-    score *= _bell(height, prior.height_m, prior.height_tolerance_m, prior.height_tolerance_m)
+    score *= _bell(height, prior.height_m, prior.height_below_m, prior.height_above_m)
     score *= prior.prior_weight * min(1.0, num_members / saturation_points) ** sparseness_power
     score *= hit * np.exp(-((free_length / free_scale) ** 2))
     clutter = ring_weight * around.ring + overhead_weight * around.overhead

@@ -74,7 +74,10 @@ def score_boxes(
         overhead_weight=settings.overhead_weight,
         recess_share=settings.recess_share,
         upright_worth=settings.upright_worth,
-        **{name: prior(name) for name in ("height_m", "height_tolerance_m", "min_height_m", "max_height_m")},
+        **{
+            name: prior(name)
+            for name in ("height_m", "height_below_m", "height_above_m", "min_height_m", "max_height_m")
+        },
     )
     height = jnp.maximum(around.top + settings.top_margin_m, prior("min_box_height_m"))
     above = jnp.zeros_like(height)
