@@ -1,11 +1,12 @@
 """jaxbox: training-free LiDAR vehicle detection as one compiled JAX function."""
 
-from jaxbox.config import DetectorConfig
+from jaxbox.config import DEFAULT_CUT, DetectorConfig
 from jaxbox.detector import detect
 from jaxbox.types import Calibration, Detections, GroundPlane, Hulls, Label, PointCloud, Status, stack_clouds
 from jaxbox.version import __version__
 
 __all__ = [
+    "DEFAULT_CUT",
     "Calibration",
     "Detections",
     "DetectorConfig",

@@ -21,8 +21,9 @@ LOOKUP_STEP = 128
 COUNT_BITS = 10
 """Bits that hold a count of up to `LOOKUP_STEP` points."""
 
-MIN_UPPER_POINTS = 3
-"""With fewer points as high as glass and roof, whether they lie behind the faces says nothing."""
+DOUBT_POINTS = 5
+"""So many upper points, with the share of full worth behind the faces, are taken for granted: of few
+points the share says little."""
 
 BOX_CHUNK = 32
 """Boxes looked at together: the loop over their points ends with the one that has most."""
@@ -302,7 +303,7 @@ def surroundings_score(
       ring_weight: exp(-weight ring / inside).
       overhead_weight: exp(-weight above / inside).
       recess_share: full worth from this share of the upper points behind the faces on.
-      upright_worth: worth where there is none; boxes with few upper points have full worth.
+      upright_worth: worth where there is none; boxes with few upper points come near to full worth.
 
     Returns:
       (P,) float32 in [0, 1]; 0 where a gate fails.
@@ -314,10 +315,9 @@ def surroundings_score(
         around.num_inside, 1
     )
     score = bell(top, height_m, height_below_m, height_above_m) * jnp.exp(-clutter)
-    recessed = around.num_recessed / jnp.maximum(around.num_upper, 1)
+    recessed = (around.num_recessed + DOUBT_POINTS * recess_share) / (around.num_upper + DOUBT_POINTS)
     worth = upright_worth + (1 - upright_worth) * jnp.minimum(recessed / recess_share, 1)
-    score = score * jnp.where(around.num_upper >= MIN_UPPER_POINTS, worth, 1)
-    return jnp.where(plausible, score, 0)
+    return jnp.where(plausible, score * worth, 0)
 
 
 def suppress(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | float) -> jax.Array:

@@ -696,9 +696,11 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     assert score(around=dataclasses.replace(around, overhead=50)) == pytest.approx(np.exp(-4))
     assert score(around=dataclasses.replace(around, top_m=2.1)) == pytest.approx(np.exp(-1))
     assert score(around=dataclasses.replace(around, upper=50, recessed=20)) == 1
-    assert score(around=dataclasses.replace(around, upper=50, recessed=10)) == pytest.approx(0.6)
-    assert score(around=dataclasses.replace(around, upper=50)) == pytest.approx(0.2)
-    assert score(around=dataclasses.replace(around, upper=2)) == 1
+    assert score(around=dataclasses.replace(around, upper=50, recessed=10)) == pytest.approx(
+        0.2 + 0.8 * 12 / 55 / 0.4
+    )
+    assert score(around=dataclasses.replace(around, upper=50)) == pytest.approx(0.2 + 0.8 * 2 / 55 / 0.4)
+    assert score(around=dataclasses.replace(around, upper=10**6)) == pytest.approx(0.2, abs=1e-4)
     # A top that reads low far away may be higher by the range allowance.
     low = dataclasses.replace(around, top_m=1.2)
     assert score(around=low) == pytest.approx(np.exp(-((0.225 / 0.3) ** 2)))

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
+from jaxbox.config import DEFAULT_CUT
 from jaxbox.types import Detections, Label, Status
 
-SHOWN_MIN_SCORE = 0.2
+SHOWN_MIN_SCORE = DEFAULT_CUT
 """Boxes that score less are written but not drawn or counted as found: most of them are no vehicle."""
 
 

@@ -8,8 +8,8 @@ from scipy.special import expit
 
 from jaxbox.class_priors import ClassPrior
 
-MIN_UPPER_POINTS = 3
-"""Fewer upper points say nothing about whether they lie behind the faces."""
+DOUBT_POINTS = 5
+"""So many upper points, with the share of full worth behind the faces, are taken for granted."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -180,9 +180,8 @@ def score_box(
     score *= hit * np.exp(-((free_length / free_scale) ** 2))
     clutter = ring_weight * around.ring + overhead_weight * around.overhead
     score *= np.exp(-clutter / max(around.inside, 1))
-    if around.upper >= MIN_UPPER_POINTS:
-        recessed = min(1.0, around.recessed / around.upper / recess_share)
-        score *= upright_worth + (1 - upright_worth) * recessed
+    share = (around.recessed + DOUBT_POINTS * recess_share) / (around.upper + DOUBT_POINTS)
+    score *= upright_worth + (1 - upright_worth) * min(1.0, share / recess_share)
     if support is not None:
         score *= min(1.0, (support + 0.5) / support_points)
     return float(score * expit((objective - objective_gate) / objective_softness))
