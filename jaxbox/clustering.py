@@ -1,5 +1,6 @@
 """Clustering on grids: connected components as proposals (paper, section 3.2, Algorithm II)."""
 
+import functools
 import itertools
 import math
 
@@ -8,6 +9,9 @@ import jax.numpy as jnp
 
 from jaxbox.masked import WORD_BITS, lookup, prefix_sum, take
 from jaxbox.types import Clusters
+
+NUM_JUMPS = 2
+"""Pointer jumps after each round of hooking: a jump costs a tenth of a round, and two halve the rounds."""
 
 
 def warp_range(xy: jax.Array, *, start_m: jax.Array | float, growth: jax.Array | float) -> jax.Array:
@@ -166,6 +170,7 @@ def _hook_and_jump(neighbours: jax.Array) -> jax.Array:
         lowest = jnp.minimum(grandparent, jnp.min(lookup(grandparent, neighbours), axis=0))
         hooked = parent.at[parent].min(lowest)
         new = jnp.minimum(hooked, lowest)
+        new = functools.reduce(lambda p, _: lookup(p, p), range(NUM_JUMPS), new)
         return new, jnp.any(new != parent)
 
     return jax.lax.while_loop(lambda state: state[1], step, (nodes, jnp.bool_(True)))[0]
