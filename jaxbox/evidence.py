@@ -147,7 +147,11 @@ def azimuth_cell(azimuth: jax.Array, num_azimuths: int) -> jax.Array:
       (...) int32, in [0, num_azimuths); cell 0 begins at -pi.
     """
     turns = (azimuth + math.pi) / (2 * math.pi)
-    return jnp.floor(turns * num_azimuths).astype(jnp.int32) % num_azimuths
+    # A remainder would divide integers, which costs more than all else here (XLA, CPU). The product may be
+    # rounded up to the whole turn.
+    whole = jnp.floor(turns).astype(jnp.int32)
+    cell = jnp.floor(turns * num_azimuths).astype(jnp.int32) - num_azimuths * whole
+    return jnp.where(cell < num_azimuths, cell, 0)
 
 
 def _prefix_over_range(beams: jax.Array, hits: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -224,7 +228,8 @@ def cast_rays(
     Reference: oracle `jaxbox.reference.box_evidence`.
     """
     there = jnp.any(length >= 0)
-    azimuth, enter, leave = store(_ray_stretches(center, length, width, yaw, num_rays), there)
+    azimuth, du, dv = store(_ray_directions(center, length, width, yaw, num_rays), there)
+    enter, leave = store(_ray_stretches(center, length, width, yaw, du, dv), there)
     met_inside = _sort_rays(evidence, azimuth, enter, leave, range_cell_m)
     crosses, met, free_cells, span = store(met_inside, there)
     total = jnp.maximum(jnp.sum(crosses, axis=-1), 1)
@@ -271,10 +276,10 @@ def _sort_rays(
     return crosses, met, free_cells.astype(jnp.int32), span
 
 
-def _ray_stretches(
+def _ray_directions(
     center: jax.Array, length: jax.Array, width: jax.Array, yaw: jax.Array, num_rays: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Azimuth, entry and exit range of the rays over a box, each (..., num_rays); exit < entry: a miss."""
+    """Azimuth of the rays over a box, and their directions in its frame, each (..., num_rays)."""
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     x, y = center[..., 0], center[..., 1]
     middle = jnp.arctan2(y, x)
@@ -287,14 +292,22 @@ def _ray_stretches(
     low, high = jnp.min(spread, axis=-1), jnp.max(spread, axis=-1)
     fraction = (jnp.arange(num_rays) + 0.5) / num_rays
     azimuth = middle[..., None] + low[..., None] + (high - low)[..., None] * fraction
+    return azimuth, jnp.cos(azimuth - yaw[..., None]), jnp.sin(azimuth - yaw[..., None])
 
-    # In the box's frame the box is |u| < length / 2, |v| < width / 2: the slab test.
-    du = jnp.cos(azimuth - yaw[..., None])
-    dv = jnp.sin(azimuth - yaw[..., None])
+
+def _ray_stretches(
+    center: jax.Array, length: jax.Array, width: jax.Array, yaw: jax.Array, du: jax.Array, dv: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Entry and exit range of rays over a box, each (..., num_rays); exit < entry: a miss.
+
+    In the box's frame the box is |u| < length / 2, |v| < width / 2: the slab test.
+    """
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    x, y = center[..., 0], center[..., 1]
     origin_u, origin_v = -(x * cos + y * sin), x * sin - y * cos
     enter_u, leave_u = _slab(origin_u[..., None], du, length[..., None] / 2)
     enter_v, leave_v = _slab(origin_v[..., None], dv, width[..., None] / 2)
-    return azimuth, jnp.maximum(enter_u, enter_v), jnp.minimum(leave_u, leave_v)
+    return jnp.maximum(enter_u, enter_v), jnp.minimum(leave_u, leave_v)
 
 
 def _slab(origin: jax.Array, direction: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
