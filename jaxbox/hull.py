@@ -98,25 +98,33 @@ def _on_hull(xy: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Which points are vertices of the lower hull and which, beside those, of the upper, (M,) bool each."""
     x, y = xy[:, 0], xy[:, 1]
     index = jnp.arange(xy.shape[0])
-    # Entry [i, j] is about the point i as seen from j.
-    dx, dy = x[:, None] - x, y[:, None] - y
-    slope = dy / jnp.where(dx == 0, 1, dx)
-    there = valid[:, None]
-    left, right, same = there & (dx < 0), there & (dx > 0), there & (dx == 0)
-    # Of points above one another only the lowest and the highest count, and of equal ones the first.
-    twin = (dy == 0) & (index[:, None] < index)
-    lowest_right = _least(right, slope, same & ((dy < 0) | twin))
-    lowest_left = _least(left, slope, same & ((dy > 0) | twin))
-    highest_left = jnp.max(jnp.where(left, slope, -jnp.inf), axis=0)
-    highest_right = jnp.max(jnp.where(right, slope, -jnp.inf), axis=0)
+
+    def see(i: jax.Array, slopes: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        # The point i as seen from all others: a loop over points vectorises, a table of pairs does not.
+        lowest_right, lowest_left, highest_left, highest_right = slopes
+        dx, dy = x[i] - x, y[i] - y
+        slope = dy / jnp.where(dx == 0, 1, dx)
+        left, right, same = valid[i] & (dx < 0), valid[i] & (dx > 0), valid[i] & (dx == 0)
+        # Of points above one another only the lowest and the highest count, and of equal ones the first.
+        twin = (dy == 0) & (i < index)
+        return (
+            jnp.minimum(lowest_right, _least(right, slope, same & ((dy < 0) | twin))),
+            jnp.minimum(lowest_left, _least(left, slope, same & ((dy > 0) | twin))),
+            jnp.maximum(highest_left, jnp.where(left, slope, -jnp.inf)),
+            jnp.maximum(highest_right, jnp.where(right, slope, -jnp.inf)),
+        )
+
+    far = jnp.full_like(x, jnp.inf)
+    slopes = jax.lax.fori_loop(0, xy.shape[0], see, (far, far, -far, -far))
+    lowest_right, lowest_left, highest_left, highest_right = slopes
     lower = valid & (highest_left < lowest_right)
     upper = valid & (highest_right < lowest_left)
     return lower, upper & ~lower
 
 
 def _least(side: jax.Array, slope: jax.Array, barred: jax.Array) -> jax.Array:
-    """(M,) least slope to the points of a side; minus infinity for a point that another one bars."""
-    return jnp.min(jnp.where(barred, -jnp.inf, jnp.where(side, slope, jnp.inf)), axis=0)
+    """(M,) slopes to a point on a side, infinite if it is not; minus infinity where it bars the other."""
+    return jnp.where(barred, -jnp.inf, jnp.where(side, slope, jnp.inf))
 
 
 def polygon_area(vertices: jax.Array) -> jax.Array:
