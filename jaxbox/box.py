@@ -9,8 +9,11 @@ import jax.numpy as jnp
 from jaxbox.masked import fold_points, group_by, map_rows
 from jaxbox.types import Rectangles
 
-CHUNK = 256
+CHUNK = 128
 """Clusters at a time: their extents at all rotations stay in the cache."""
+
+TABLE_CHUNK = 256
+"""Clusters whose points are listed at a time."""
 
 VOTE_POINTS, VOTE_EXTENT_M = 150.0, 6.0
 """A vote for the scene direction counts min(points, 150) x min(extent, 6 m)."""
@@ -37,11 +40,18 @@ def sample_points(cluster: jax.Array, *, num_clusters: int, max_points: int) -> 
     order, start = group_by(cluster, num_clusters)
     total = jnp.diff(start)
     j = jnp.arange(max_points)
-    spread = (j * (total // max_points)[:, None]) + j * (total % max_points)[:, None] // max_points
-    offset = jnp.where(total[:, None] > max_points, spread, j)
-    count = jnp.minimum(total, max_points)
-    index = order[jnp.minimum(start[:-1, None] + offset, cluster.shape[0] - 1)]
-    return jnp.where(j < count[:, None], index, cluster.shape[0]), count
+
+    def pick(rows: tuple[jax.Array, jax.Array]) -> jax.Array:
+        first, total = (a[:, None] for a in rows)
+        spread = j * (total // max_points) + j * (total % max_points) // max_points
+        offset = jnp.where(total > max_points, spread, j)
+        index = order[jnp.minimum(first + offset, cluster.shape[0] - 1)]
+        return jnp.where(j < total, index, cluster.shape[0])
+
+    num_present = jnp.max(jnp.where(total > 0, jnp.arange(1, num_clusters + 1), 0), initial=0)
+    index = map_rows(pick, (start[:-1], total), num_rows=num_present, chunk=TABLE_CHUNK)
+    present = jnp.arange(num_clusters) < num_present
+    return jnp.where(present[:, None], index, cluster.shape[0]), jnp.minimum(total, max_points)
 
 
 def try_rotations(
@@ -91,7 +101,7 @@ def _extents(points: jax.Array, count: jax.Array, cos: jax.Array, sin: jax.Array
         return jnp.minimum(u0, u), jnp.maximum(u1, u), jnp.minimum(v0, v), jnp.maximum(v1, v)
 
     far = jnp.full((points.shape[0], cos.shape[0]), jnp.inf)
-    extents = fold_points(points, count, (far, -far, far, -far), update)
+    extents = fold_points(points, count, (far, -far, far, -far), update, twice=True)
     return jax.tree.map(lambda e: jnp.where((count > 0)[:, None], e, 0), extents)
 
 

@@ -4,6 +4,7 @@ Every function keeps static shapes. A row that is absent is marked by the sentin
 the last; `take` reads zeros there and scatters with ``mode="drop"`` ignore it.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -14,7 +15,13 @@ BLOCK = 512
 """Columns of the two-level prefix sum: XLA's CPU cumulative sum slows down with its length."""
 
 WORD_BITS = 32
-"""Bits of a word of a `CellSet`."""
+"""Bits of a word of a set of flags."""
+
+SORT_STEPS = 4
+"""Sorts are as long as what is there, in so many steps."""
+
+FOLD_UNROLL = 2
+"""Points folded in one step of the loop over them."""
 
 
 def prefix_sum(values: jax.Array) -> jax.Array:
@@ -30,10 +37,25 @@ def prefix_sum(values: jax.Array) -> jax.Array:
     [1, 1, 3]
     """
     size = values.shape[0]
+    if values.dtype == bool and size > BLOCK:
+        return _count_before(values)
     blocks = jnp.pad(values.astype(jnp.int32), (0, -size % BLOCK)).reshape(-1, BLOCK)
     inside = jnp.cumsum(blocks, axis=1)
     before = jnp.cumsum(inside[:, -1]) - inside[:, -1]
     return (inside + before[:, None]).reshape(-1)[:size]
+
+
+def _count_before(mask: jax.Array) -> jax.Array:
+    """(N,) prefix sum of truth values, as the bits of words: a sum over words, and bits counted in one."""
+    size = mask.shape[0]
+    bit = jnp.arange(WORD_BITS, dtype=jnp.uint32)
+    bits = jnp.pad(mask, (0, -size % WORD_BITS)).reshape(-1, WORD_BITS)
+    words = jnp.sum(jnp.where(bits, jnp.uint32(1) << bit, jnp.uint32(0)), axis=1, dtype=jnp.uint32)
+    population = jax.lax.population_count(words).astype(jnp.int32)
+    before = prefix_sum(population) - population
+    up_to = (jnp.uint32(2) << bit) - 1
+    inside = jax.lax.population_count(words[:, None] & up_to).astype(jnp.int32)
+    return (before[:, None] + inside).reshape(-1)[:size]
 
 
 def compact(mask: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
@@ -168,6 +190,54 @@ def map_rows(function: Callable[[Any], Any], rows: Any, *, num_rows: jax.Array, 
     return jax.tree.map(lambda a: a[:capacity], out)
 
 
+def map_by_size(
+    function: Callable[[Any], Any],
+    rows: Any,
+    size: jax.Array,
+    *,
+    max_size: int,
+    num_rows: jax.Array,
+    chunk: int,
+) -> Any:
+    """As `map_rows`, with rows of like size in one chunk.
+
+    For functions with a loop that ends with the largest row of its chunk: few chunks hold the large ones.
+
+    Args:
+      function: maps a pytree of (chunk, ...) arrays to another one, each row by itself.
+      rows: pytree of (P, ...) arrays.
+      size: (P,) int32, in [0, max_size].
+      max_size: static.
+      num_rows: () int32, how many rows count.
+      chunk: static, rows at a time.
+
+    Returns:
+      Pytree of (P, ...) arrays, in the order of `rows`; those beyond `num_rows` may be anything finite.
+    """
+    order, place = largest_first(jnp.where(jnp.arange(size.shape[0]) < num_rows, size, 0), max_size)
+    mapped = map_rows(function, jax.tree.map(lambda a: a[order], rows), num_rows=num_rows, chunk=chunk)
+    return jax.tree.map(lambda a: a[place], mapped)
+
+
+def largest_first(size: jax.Array, max_size: int) -> tuple[jax.Array, jax.Array]:
+    """Orders rows by descending size, keeping their order within one.
+
+    Args:
+      size: (P,) int32, in [0, max_size].
+      max_size: static.
+
+    Returns:
+      order: (P,) int32 row indices.
+      place: (P,) int32: row i is order[place[i]].
+
+    >>> order, place = largest_first(jnp.array([1, 3, 1]), 4)
+    >>> order.tolist(), place.tolist()
+    ([1, 0, 2], [1, 0, 2])
+    """
+    order, _ = group_by(max_size - size, max_size + 1)
+    return order, jnp.zeros_like(order).at[order].set(jnp.arange(order.shape[0], dtype=order.dtype))
+
+
 def group_by(group: jax.Array, num_groups: int) -> tuple[jax.Array, jax.Array]:
     """Orders rows by group, keeping their order within one.
 
@@ -188,7 +258,7 @@ def group_by(group: jax.Array, num_groups: int) -> tuple[jax.Array, jax.Array]:
     index = jnp.arange(size, dtype=jnp.uint32)
     if index_bits + group_bits <= WORD_BITS:
         # One packed word sorts several times faster than a key with its value.
-        packed = jax.lax.sort((group.astype(jnp.uint32) << index_bits) | index, is_stable=False)
+        packed = _sort_present((group.astype(jnp.uint32) << index_bits) | index, group < num_groups)
         order = packed & (2**index_bits - 1)
     else:
         order = jax.lax.sort((group, index), num_keys=1, is_stable=True)[1]
@@ -197,8 +267,27 @@ def group_by(group: jax.Array, num_groups: int) -> tuple[jax.Array, jax.Array]:
     return order.astype(jnp.int32), jnp.concatenate([jnp.zeros(1, jnp.int32), end])
 
 
+def _sort_present(words: jax.Array, present: jax.Array) -> jax.Array:
+    """Sorts words of which the absent ones are largest and in order: those past the last present one stay."""
+    size = words.shape[0]
+    step = -(-size // SORT_STEPS)
+    num = jnp.max(jnp.where(present, jnp.arange(1, size + 1), 0), initial=0)
+
+    def sort_first(count: int, words: jax.Array) -> jax.Array:
+        return jnp.concatenate([jax.lax.sort(words[:count], is_stable=False), words[count:]])
+
+    counts = [min(step * (i + 1), size) for i in range(SORT_STEPS)]
+    branches = [functools.partial(sort_first, count) for count in counts]
+    return jax.lax.switch(jnp.maximum(num - 1, 0) // max(step, 1), branches, words)
+
+
 def fold_points(
-    points: jax.Array, count: jax.Array, init: Any, update: Callable[[Any, jax.Array, jax.Array], Any]
+    points: jax.Array,
+    count: jax.Array,
+    init: Any,
+    update: Callable[[Any, jax.Array, jax.Array], Any],
+    *,
+    twice: bool = False,
 ) -> Any:
     """Folds the points of many clusters into a wide state, one point of each cluster at a time.
 
@@ -210,15 +299,27 @@ def fold_points(
       count: (C,) int32, points of each cluster.
       init: pytree of (C, ...) arrays, the state before the first point.
       update: maps the state and x (C, 1), y (C, 1) to the next state.
+      twice: static, whether a point may be seen more than once, as when their bounds are sought: a
+        cluster that is through sees its first point again, which costs less than to leave it alone. A
+        cluster without points sees one too, anything finite.
 
     Returns:
       The state after the last point of each cluster.
     """
-    by_point = jnp.swapaxes(points, 0, 1)
+    capacity = points.shape[1]
+    by_point = jnp.swapaxes(jnp.pad(points, [(0, 0), (0, -capacity % FOLD_UNROLL), (0, 0)]), 0, 1)
+    if twice:
+        there = jnp.arange(by_point.shape[0])[:, None] < jnp.minimum(count, capacity)
+        by_point = jnp.where(there[..., None], by_point, by_point[:1])
 
-    def step(m: jax.Array, state: Any) -> Any:
-        xy = by_point[m]
-        new = update(state, xy[:, :1], xy[:, 1:])
-        return jax.tree.map(lambda n, o: jnp.where((m < count)[:, None], n, o), new, state)
+    def step(i: jax.Array, state: Any) -> Any:
+        for k in range(FOLD_UNROLL):
+            m = FOLD_UNROLL * i + k
+            xy = by_point[m]
+            new = update(state, xy[:, :1], xy[:, 1:])
+            there = (m < jnp.minimum(count, capacity))[:, None]
+            state = new if twice else jax.tree.map(lambda n, o, t=there: jnp.where(t, n, o), new, state)
+        return state
 
-    return jax.lax.fori_loop(0, jnp.minimum(jnp.max(count), points.shape[1]), step, init)
+    most = jnp.minimum(jnp.max(count), capacity)
+    return jax.lax.fori_loop(0, (most + FOLD_UNROLL - 1) // FOLD_UNROLL, step, init)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.geometry import rectangle_iou
-from jaxbox.masked import group_by, map_rows, take
+from jaxbox.masked import group_by, map_by_size, map_rows, take
 
 NEARBY_CELL_M = 1.0
 """Points are looked up by cells of this size."""
@@ -96,11 +96,20 @@ def count_points_around(
     order, start = group_by(jnp.where(member, index[:, 0] * shape[1] + index[:, 1], num_cells), num_cells)
     points = jnp.concatenate([xy, height[:, None]], axis=1)[order]
 
-    def look(rows: tuple[jax.Array, jax.Array, jax.Array]) -> Surroundings:
-        first, length = _cell_runs(rows[0], start, shape, half_x_m, half_y_m, ring_m)
-        return _count_runs(*rows, first, length, points, max_nearby, margin_m, ring_m, upper_height_m)
+    first, length = _cell_runs(boxes, start, shape, half_x_m, half_y_m, ring_m)
 
-    return map_rows(look, (boxes, count_max_height_m, recess_m), num_rows=num_boxes, chunk=BOX_CHUNK)
+    def look(rows: tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]) -> Surroundings:
+        return _count_runs(*rows, points, max_nearby, margin_m, ring_m, upper_height_m)
+
+    num_steps = (jnp.minimum(jnp.sum(length, axis=1), max_nearby) + LOOKUP_STEP - 1) // LOOKUP_STEP
+    return map_by_size(
+        look,
+        (boxes, count_max_height_m, recess_m, first, length),
+        num_steps,
+        max_size=-(-max_nearby // LOOKUP_STEP),
+        num_rows=num_boxes,
+        chunk=BOX_CHUNK,
+    )
 
 
 def _cell_runs(

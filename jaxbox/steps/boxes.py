@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jaxbox import box, completion, evidence, hull
 from jaxbox.config import CompletionConfig, DetectorConfig
-from jaxbox.masked import compact, map_rows, take
+from jaxbox.masked import compact, largest_first, map_by_size, map_rows, take
 from jaxbox.steps.common import class_values, stage_options
 from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals, Trials, list_trials, longest_side
@@ -19,12 +19,12 @@ from jaxbox.types import NOT_A_BOX, Boxes, Rectangles
 INSISTENCE = 5.0
 """How often the scene's direction counts for the second reading of a cluster: it bends a closeness only."""
 
-PROPOSAL_CHUNK = 512
+PROPOSAL_CHUNK = 128
 """Proposals held against the evidence at a time: a loop over their points has few, wide steps."""
 
 
-HULL_CHUNK = 16
-"""Clusters whose hulls are traced at a time: each compares all pairs of its points."""
+HULL_CHUNK = 32
+"""Clusters whose hulls are traced at a time."""
 
 
 @jax.tree_util.register_dataclass
@@ -32,8 +32,9 @@ HULL_CHUNK = 16
 class Fits:
     """All rotations of all clusters, and the points that they were fitted to."""
 
-    curve: jax.Array  # (P, A)
-    extents: box.Extents
+    curve: jax.Array  # (P, A), the clusters with most points first
+    extents: box.Extents  # likewise
+    place: jax.Array  # (P,) where each cluster is in those
     points: jax.Array  # (P, M, 2) m
     count: jax.Array  # (P,)
     hull_vertices: jax.Array  # () of the largest hull that was fitted to; 0 where none was
@@ -44,15 +45,22 @@ def fit_rectangles(obstacles: Obstacles, proposals: Proposals, config: DetectorC
     settings = config.box
     outline = _hull_points if settings.fit_to == "hull" else _slab_points
     points, count, hull_vertices = outline(obstacles, proposals, config)
+    order, place = largest_first(count, points.shape[1])
     curve, extents = box.try_rotations(
-        points,
-        count,
+        points[order],
+        count[order],
         proposals.num_clusters,
         criterion=settings.criterion,
         num_angles=settings.num_angles,
         min_distance_m=settings.min_distance_m,
     )
-    return Fits(curve, extents, points, count, hull_vertices)
+    return Fits(curve, extents, place, points, count, hull_vertices)
+
+
+def best_rectangles(fits: Fits, preference: jax.Array, insistence: float = 1.0) -> Rectangles:
+    """The rectangle of each cluster at its best rotation, see `box.best_rectangles`."""
+    rectangles = box.best_rectangles(fits.curve, fits.extents, preference, insistence=insistence)
+    return jax.tree.map(lambda a: a[fits.place], rectangles)
 
 
 def _hull_points(
@@ -82,17 +90,20 @@ def _slab_points(
     obstacles: Obstacles, proposals: Proposals, config: DetectorConfig
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The points of each cluster between the slab's heights, or all where those are few."""
-    num_clusters, num_obstacles = proposals.num_points.shape[0], obstacles.row.shape[0]
-    rows, clusters = [], []
-    for cluster, used in zip(proposals.cluster, proposals.fitted, strict=True):
-        row, _ = compact(used, max_slab_points(obstacles.num_rows, config))
-        rows.append(row)
-        clusters.append(take(cluster, row, num_clusters))
-    index, count = box.sample_points(
-        jnp.concatenate(clusters), num_clusters=num_clusters, max_points=config.box.max_points
-    )
-    row = take(jnp.concatenate(rows), index, num_obstacles)
-    return take(obstacles.xy, row), count, jnp.int32(0)
+    num_maps, num_obstacles = proposals.cluster.shape
+    num_clusters = proposals.num_points.shape[0]
+    # The points of all maps in one list, without gaps: it is sorted as far as it is filled.
+    entry, _ = compact(proposals.fitted.reshape(-1), num_maps * max_slab_points(obstacles.num_rows, config))
+    cluster = take(proposals.cluster.reshape(-1), entry, num_clusters)
+    index, count = box.sample_points(cluster, num_clusters=num_clusters, max_points=config.box.max_points)
+
+    def gather(index: jax.Array) -> jax.Array:
+        place = take(entry, index, num_maps * num_obstacles)
+        row = jnp.where(place < num_maps * num_obstacles, place % num_obstacles, num_obstacles)
+        return take(obstacles.xy, row)
+
+    points = map_rows(gather, index, num_rows=proposals.num_clusters, chunk=box.TABLE_CHUNK)
+    return points, count, jnp.int32(0)
 
 
 def max_slab_points(capacity: int, config: DetectorConfig) -> int:
@@ -117,9 +128,9 @@ def complete_boxes(
     preference = jnp.zeros(config.box.num_angles)
     if config.box.scene_direction and seen is not None:
         preference = _scene_preference(fits, proposals, seen, config)
-    readings = [box.best_rectangles(fits.curve, fits.extents, preference)]
+    readings = [best_rectangles(fits, preference)]
     if config.box.scene_direction and config.completion.along_scene:
-        readings.append(box.best_rectangles(fits.curve, fits.extents, preference, insistence=INSISTENCE))
+        readings.append(best_rectangles(fits, preference, INSISTENCE))
     trials = list_trials(proposals, readings, config)
     return trials, _complete(trials, readings, fits, seen, config)
 
@@ -130,11 +141,10 @@ def _scene_preference(
     """The direction that the first map's boxes, fitted without a preference, vote for."""
     settings = config.box
     size = proposals.maps[0].num_points.shape[0]
-    first = jax.tree.map(lambda a: a[:size] if a.ndim else a, fits)
-    rectangles = box.best_rectangles(first.curve, first.extents, jnp.zeros(settings.num_angles))
+    rectangles = jax.tree.map(lambda a: a[:size], best_rectangles(fits, jnp.zeros(settings.num_angles)))
     long = longest_side(rectangles) >= settings.direction_min_extent_m
     cluster, num = compact(long & (jnp.arange(size) < proposals.num_first), size)
-    boxes = _complete(Trials(cluster, jnp.zeros_like(cluster), num), [rectangles], first, seen, config)
+    boxes = _complete(Trials(cluster, jnp.zeros_like(cluster), num), [rectangles], fits, seen, config)
     rays = cast_rays(boxes, num, seen, config)
     voting = (jnp.arange(size) < num) & (boxes.objective > NOT_A_BOX)
     voting = voting & (rays.free_length <= settings.direction_max_free)
@@ -188,7 +198,14 @@ def _complete(
             **_fields(settings, _OBJECTIVE_FIELDS),
         )
 
-    return map_rows(complete, (trials.cluster, limits, usual), num_rows=trials.num, chunk=PROPOSAL_CHUNK)
+    return map_by_size(
+        complete,
+        (trials.cluster, limits, usual),
+        take(fits.count, trials.cluster),
+        max_size=fits.points.shape[1],
+        num_rows=trials.num,
+        chunk=PROPOSAL_CHUNK,
+    )
 
 
 _SIDE_FIELDS = ("seen_length", "seen_width", "seen_weight", "length_margin_m", "width_margin_m")
