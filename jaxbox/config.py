@@ -319,7 +319,7 @@ class VehicleConfig:
     """score x exp(-(free length of the rays inside / scale)^2), beside x the fraction of rays that hit."""
     ring_weight: Scalar = 8.0
     """score x exp(-weight x ring points / points)."""
-    overhead_weight: Scalar = 8.0
+    overhead_weight: Scalar = 6.0
     """score x exp(-weight x points above / points)."""
     upper_height_m: Scalar = 0.9
     """Points higher than this are glass, bonnet and roof; see ``ClassPrior.recess_m``."""

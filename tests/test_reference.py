@@ -693,7 +693,7 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     assert score(support=4.5) == pytest.approx(0.5)
     assert score(objective=2.4) == pytest.approx(0.5)
     assert score(around=dataclasses.replace(around, ring=25)) == pytest.approx(np.exp(-2))
-    assert score(around=dataclasses.replace(around, overhead=50)) == pytest.approx(np.exp(-4))
+    assert score(around=dataclasses.replace(around, overhead=50)) == pytest.approx(np.exp(-3))
     assert score(around=dataclasses.replace(around, top_m=2.1)) == pytest.approx(np.exp(-1))
     assert score(around=dataclasses.replace(around, upper=50, recessed=20)) == 1
     assert score(around=dataclasses.replace(around, upper=50, recessed=10)) == pytest.approx(
