@@ -50,6 +50,7 @@ ABLATIONS = (
     # Points.
     Ablation("no filter", {"filtering.enabled": False}),
     Ablation("one plane instead of the ground grid", {"ground.surface": False, **MORE_POINTS}),
+    Ablation("ground grid of twice the grade", {"ground.max_grade": 0.2}),
     # Proposals.
     Ablation("one map: 0.2 m", _without_maps(1, 2, 3)),
     Ablation("one map: 0.35 m", {"clustering.maps.0.cell_m": 0.35, **_without_maps(1, 2, 3)}),
@@ -71,6 +72,8 @@ ABLATIONS = (
     Ablation("hypotheses blind to free space", {
         "completion.free_weight": 0.0, "completion.free_length_weight": 0.0,
     }),
+    Ablation("no second reading along the scene", {"completion.along_scene": False}),
+    Ablation("sides of the class's size, not the likely one", {"completion.seen_weight": 0.0}),
     Ablation("no lowest box height", {"vehicles.classes.0.min_box_height_m": 0.0}),
     # Score.
     Ablation("no free length, no objective in the score", {
@@ -81,6 +84,8 @@ ABLATIONS = (
     Ablation("no ring, no overhead penalty", {"vehicles.ring_weight": 0.0, "vehicles.overhead_weight": 0.0}),
     Ablation("no ring penalty", {"vehicles.ring_weight": 0.0}),
     Ablation("no overhead penalty", {"vehicles.overhead_weight": 0.0}),
+    Ablation("upright things not told from cars", {"vehicles.upright_worth": 1.0}),
+    Ablation("vans from 2.0 m on", {"vehicles.classes.1.min_height_m": 2.0}),
     Ablation("no ground support", {"vehicles.support_points": 1 / NO_LIMIT}),
     Ablation("no sparseness", {"vehicles.sparseness_power": 0.0}),
     Ablation("height gate that does not widen with range", {"vehicles.top_grade": 0.0}),
