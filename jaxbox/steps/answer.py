@@ -8,12 +8,18 @@ import jax.numpy as jnp
 
 from jaxbox import descriptors, hull, vehicles
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import compact, map_rows, store, take
+from jaxbox.masked import compact, map_rows, take
 from jaxbox.steps.boxes import HULL_CHUNK, Fits, max_slab_points, trace_hulls
 from jaxbox.steps.decision import Candidates
 from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals
-from jaxbox.types import Counts, Detections, Hulls, PointCloud, Status
+from jaxbox.types import Counts, Descriptors, Detections, Hulls, PointCloud, Status
+
+OWNED_SHARE = 4
+"""Detections mostly own less than this part of the obstacle points."""
+
+OWNER_CHUNK = 4096
+"""Points whose detections are looked up at a time."""
 
 INSIDE_TOLERANCE_M = 1e-3
 """A point on the face of its box is inside."""
@@ -35,19 +41,11 @@ def conclude(
     row, num = compact(keep, settings.max_detections)
     kept = jax.tree.map(lambda a: take(a, row), dataclasses.replace(candidates, num=keep))
     valid = row < keep.shape[0]
-    owner = store(_owners(kept, valid, obstacles, proposals), ~jnp.all(cloud.num_points < 0))
-    outline = hull.extreme_points(
-        owner, obstacles.xy, num_clusters=settings.max_detections, num_slices=config.hull.num_slices
-    )
-    trace = functools.partial(trace_hulls, obstacles.xy, config.hull.max_vertices)
-    vertices, num_vertices = map_rows(trace, outline, num_rows=num, chunk=HULL_CHUNK)
-    num_points = jnp.zeros(settings.max_detections, jnp.int32).at[owner].add(1, mode="drop")
-    shapes = descriptors.shape_descriptors(
-        owner, obstacles.xy, kept.rectangle[:, :2], hull.polygon_area(vertices), num_vertices
-    )
+    owner = _owners(kept, valid, obstacles, proposals)
+    num_points, hulls, shapes = _describe(owner, kept, num, obstacles, config)
     center = jnp.concatenate([kept.rectangle[:, :2], (kept.bottom + kept.height / 2)[:, None]], axis=1)
     size = jnp.concatenate([kept.rectangle[:, 2:4], kept.height[:, None]], axis=1)
-    largest_hull = jnp.maximum(jnp.max(num_vertices), fits.hull_vertices)
+    largest_hull = jnp.maximum(jnp.max(hulls.num_vertices), fits.hull_vertices)
     counts = _counts(cloud, sweep, heights, obstacles, proposals, candidates, num, largest_hull, config)
 
     def per_point(value: jax.Array, absent: int) -> jax.Array:
@@ -62,7 +60,7 @@ def conclude(
         label=kept.label,
         valid=valid,
         num_points=num_points,
-        hulls=Hulls(vertices, num_vertices),
+        hulls=hulls,
         descriptors=shapes,
         ground=heights.plane,
         ground_mask=sweep.inlier & (heights.height <= config.ground.min_height_m),
@@ -73,6 +71,30 @@ def conclude(
     )
 
 
+def _describe(
+    owner: jax.Array, kept: Candidates, num: jax.Array, obstacles: Obstacles, config: DetectorConfig
+) -> tuple[jax.Array, Hulls, Descriptors]:
+    """How many points each detection has, and their hull and shape."""
+    size, capacity = config.vehicles.max_detections, owner.shape[0]
+    trace = functools.partial(trace_hulls, max_vertices=config.hull.max_vertices)
+    row, num_owned = compact(owner < size, capacity)
+
+    def describe(row: jax.Array) -> tuple[jax.Array, Hulls, Descriptors]:
+        of, xy = take(owner, row, size), take(obstacles.xy, row)
+        outline = hull.extreme_points(of, xy, num_clusters=size, num_slices=config.hull.num_slices)
+        vertices, num_vertices = map_rows(
+            functools.partial(trace, xy), outline, num_rows=num, chunk=HULL_CHUNK
+        )
+        num_points = jnp.zeros(size, jnp.int32).at[of].add(1, mode="drop")
+        area = hull.polygon_area(vertices)
+        shapes = descriptors.shape_descriptors(of, xy, kept.rectangle[:, :2], area, num_vertices)
+        return num_points, Hulls(vertices, num_vertices), shapes
+
+    # Few points belong to a detection as a rule, and the work is in proportion to their list.
+    few = capacity // OWNED_SHARE
+    return jax.lax.cond(num_owned <= few, lambda: describe(row[:few]), lambda: describe(row))
+
+
 def _owners(kept: Candidates, valid: jax.Array, obstacles: Obstacles, proposals: Proposals) -> jax.Array:
     """(O,) the detection each point belongs to, K for none: the best of its clusters' boxes that hold it."""
     num_detections, num_clusters = valid.shape[0], proposals.num_points.shape[0]
@@ -80,15 +102,25 @@ def _owners(kept: Candidates, valid: jax.Array, obstacles: Obstacles, proposals:
     of_cluster = jnp.full(num_clusters, num_detections).at[kept.cluster].min(rank, mode="drop")
     x, y, length, width, yaw = kept.rectangle.T
     frame = jnp.stack([x, y, jnp.cos(yaw), jnp.sin(yaw), length / 2, width / 2], axis=1)
-    owner = jnp.full(obstacles.row.shape, num_detections)
-    for cluster in proposals.cluster:
-        detection = take(of_cluster, cluster, num_detections)
-        x, y, cos, sin, half_length, half_width = take(frame, detection).T
-        dx, dy = obstacles.xy[:, 0] - x, obstacles.xy[:, 1] - y
-        inside = jnp.abs(dx * cos + dy * sin) <= half_length + INSIDE_TOLERANCE_M
-        inside = inside & (jnp.abs(dy * cos - dx * sin) <= half_width + INSIDE_TOLERANCE_M)
-        owner = jnp.minimum(owner, jnp.where(inside, detection, num_detections))
-    return owner
+    of_point = [take(of_cluster, cluster, num_detections) for cluster in proposals.cluster]
+    asked, num_asked = compact(
+        functools.reduce(jnp.minimum, of_point) < num_detections, obstacles.row.shape[0]
+    )
+
+    def own(row: jax.Array) -> jax.Array:
+        xy = take(obstacles.xy, row)
+        owner = jnp.full(row.shape, num_detections)
+        for each in of_point:
+            detection = take(each, row, num_detections)
+            x, y, cos, sin, half_length, half_width = take(frame, detection).T
+            dx, dy = xy[:, 0] - x, xy[:, 1] - y
+            inside = jnp.abs(dx * cos + dy * sin) <= half_length + INSIDE_TOLERANCE_M
+            inside = inside & (jnp.abs(dy * cos - dx * sin) <= half_width + INSIDE_TOLERANCE_M)
+            owner = jnp.minimum(owner, jnp.where(inside, detection, num_detections))
+        return owner
+
+    owner = map_rows(own, asked, num_rows=num_asked, chunk=OWNER_CHUNK)
+    return jnp.full(obstacles.row.shape, num_detections).at[asked].set(owner, mode="drop")
 
 
 def _counts(

@@ -75,12 +75,12 @@ def _hull_points(
         num_slices=config.hull.num_slices,
     )
     index = jnp.where(index < proposals.cluster.size, index % num_obstacles, num_obstacles)
-    trace = functools.partial(trace_hulls, obstacles.xy, config.hull.max_vertices)
+    trace = functools.partial(trace_hulls, obstacles.xy, max_vertices=config.hull.max_vertices)
     vertices, count = map_rows(trace, index, num_rows=proposals.num_clusters, chunk=HULL_CHUNK)
     return vertices, jnp.minimum(count, config.hull.max_vertices), jnp.max(count)
 
 
-def trace_hulls(xy: jax.Array, max_vertices: int, index: jax.Array) -> tuple[jax.Array, jax.Array]:
+def trace_hulls(xy: jax.Array, index: jax.Array, *, max_vertices: int) -> tuple[jax.Array, jax.Array]:
     """Hulls of the clusters whose points are listed: (C, H, 2) m, and their true numbers of vertices."""
     one = functools.partial(hull.convex_hull, max_vertices=max_vertices)
     return jax.vmap(one)(take(xy, index), index < xy.shape[0])
