@@ -7,7 +7,7 @@ import jax
 
 from jaxbox import steps
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import store
+from jaxbox.masked import apart
 from jaxbox.types import Detections, PointCloud
 
 
@@ -59,19 +59,21 @@ def _as_float(threshold: Any) -> Any:
 @jax.jit
 @jax.custom_batching.sequential_vmap
 def _detect_jit(cloud: PointCloud, config: DetectorConfig, key: jax.Array) -> Detections:
-    # What a step finds is stored, or the compiler would work it out again in each later step that reads it.
-    keep = functools.partial(store, proof=cloud.num_points >= 0)
+    # What a step finds is stored, or the compiler would work it out again in each later step that reads it,
+    # and its scratch memory is freed: beyond 32 MB, glibc would return it to the system at each call, and
+    # a sixth of the time would go into getting it back page by page.
+    run = functools.partial(apart, proof=cloud.num_points >= 0)
     # 3.1 Statistical filtering, and ground removal by RANSAC (Algorithm I).
-    sweep = keep(steps.select_points(cloud, config))
-    heights = keep(steps.remove_ground(sweep, config, key))
-    obstacles = keep(steps.gather_obstacles(sweep, heights, config))
+    sweep = run(steps.select_points, cloud, config)
+    heights = run(steps.remove_ground, sweep, config, key)
+    obstacles = run(steps.gather_obstacles, sweep, heights, config)
     # 3.2 Segmentation by 3D grid subdivision (Algorithm II): several maps, several proposals.
-    proposals = keep(steps.propose_clusters(obstacles, config))
+    proposals = run(steps.propose_clusters, obstacles, config)
     # 3.3, 3.4 Convex hull and minimum rectangle over all rotations (Algorithm III).
-    fits = steps.fit_rectangles(obstacles, proposals, config)
+    fits = run(steps.fit_rectangles, obstacles, proposals, config)
     # Correction for occluded objects: what the beams saw decides how each box goes on out of sight.
-    seen = steps.build_evidence(sweep, heights, config)
-    trials, boxes = steps.complete_boxes(fits, proposals, seen, config)
+    seen = run(steps.build_evidence, sweep, heights, config)
+    trials, boxes = run(steps.complete_boxes, fits, proposals, seen, config)
     # Vehicle decision: score, suppression, and (3.5) the descriptors of what is left.
-    candidates = steps.score_boxes(trials, boxes, proposals, obstacles, heights, seen, config)
-    return steps.conclude(cloud, sweep, heights, obstacles, proposals, fits, candidates, config)
+    candidates = run(steps.score_boxes, trials, boxes, proposals, obstacles, heights, seen, config)
+    return run(steps.conclude, cloud, sweep, heights, obstacles, proposals, fits, candidates, config)

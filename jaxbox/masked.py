@@ -127,6 +127,29 @@ def store(values: Any, proof: jax.Array) -> Any:
     return jax.lax.cond(proof, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
 
 
+def apart(function: Callable[..., Any], *operands: Any, proof: jax.Array) -> Any:
+    """Calls a function in a room of its own: its scratch memory lives while it runs, and no longer.
+
+    XLA makes constants, such as the zeros that a scatter starts from, as early as it can: those of a long
+    program would all be there from its start, beside the scratch of whatever comes first. What is inside a
+    conditional is made when it is needed, and computed once, see `store`.
+
+    Args:
+      function: of the operands.
+      *operands: whatever it takes.
+      proof: () bool, True whenever the result is wanted; the compiler must not know that it is.
+
+    Returns:
+      The function's result, or zeros where `proof` is False.
+    """
+    shapes = jax.eval_shape(function, *operands)
+    return jax.lax.cond(
+        proof,
+        lambda: function(*operands),
+        lambda: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes),
+    )
+
+
 def masked_mean(values: jax.Array, mask: jax.Array) -> jax.Array:
     """Mean of the masked values along the last axis; 0 where there are none.
 
