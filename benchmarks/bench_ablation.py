@@ -52,11 +52,10 @@ ABLATIONS = (
     Ablation("one plane instead of the ground grid", {"ground.surface": False, **MORE_POINTS}),
     Ablation("ground grid of twice the grade", {"ground.max_grade": 0.2}),
     # Proposals.
-    Ablation("one map: 0.2 m", _without_maps(1, 2, 3)),
-    Ablation("one map: 0.35 m", {"clustering.maps.0.cell_m": 0.35, **_without_maps(1, 2, 3)}),
-    Ablation("maps without 0.35 m", _without_maps(1)),
-    Ablation("maps without 0.1 m", _without_maps(2)),
-    Ablation("maps without 0.5 m", _without_maps(3)),
+    Ablation("one map: 0.2 m", _without_maps(1, 2)),
+    Ablation("one map: 0.35 m", {"clustering.maps.0.cell_m": 0.35, **_without_maps(1, 2)}),
+    Ablation("maps without 0.1 m", _without_maps(1)),
+    Ablation("maps without 0.5 m", _without_maps(2)),
     Ablation("cells that do not grow with range", {"clustering.adaptive_growth": 0.0}),
     # Rectangle.
     Ablation("rectangle of points up to 2.0 m", {"box.slab_max_height_m": 2.0, **MORE_POINTS}),

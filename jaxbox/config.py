@@ -149,7 +149,6 @@ class ClusteringConfig:
 
     maps: tuple[ComponentMap, ...] = (
         ComponentMap(cell_m=0.2, max_cells=14336),
-        ComponentMap(cell_m=0.35, max_cells=8192),
         ComponentMap(cell_m=0.1, max_cells=20480, min_height_m=0.3, max_height_m=2.0),
         ComponentMap(cell_m=0.5, max_cells=8192),
     )
