@@ -14,7 +14,7 @@ from jaxbox.reference.clusters import NO_CLUSTER
 
 SETTINGS = parity.CONFIG.clustering
 WARP = {"start_m": SETTINGS.adaptive_start_m, "growth": SETTINGS.adaptive_growth}
-MAPS = {"bird's-eye view": SETTINGS.maps[1], "3D": DetectorConfig.paper().clustering.maps[0]}
+MAPS = {"bird's-eye view": ComponentMap(cell_m=0.35), "3D": DetectorConfig.paper().clustering.maps[0]}
 GATES = parity.select_options(SETTINGS, "min_points", "max_extent_m")
 MAX_CELLS = 2**15
 
