@@ -108,12 +108,10 @@ def build_evidence(
     azimuth = azimuth_cell(jnp.arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths)
     seen = mask & (rho >= min_range_m)
 
-    size = (num_ranges + 1) * num_azimuths
+    def scatter(range_cell: jax.Array, value: jax.Array, grid: jax.Array) -> jax.Array:
+        return grid.at[range_cell * num_azimuths + azimuth].add(value.astype(jnp.int32), mode="drop")
 
-    def scatter(range_cell: jax.Array, there: jax.Array, grid: jax.Array, step: int = 1) -> jax.Array:
-        return grid.at[jnp.where(there, range_cell * num_azimuths + azimuth, size)].add(step, mode="drop")
-
-    empty = jnp.zeros(size, jnp.int32)
+    empty = jnp.zeros((num_ranges + 1) * num_azimuths, jnp.int32)
     is_hit = seen & (hit_min_height_m < height) & (height < hit_max_height_m)
     hit_range = (rho / range_cell_m).astype(jnp.int32)
     hits = scatter(jnp.minimum(hit_range, num_ranges), is_hit & (hit_range < num_ranges), empty)
@@ -129,7 +127,7 @@ def build_evidence(
     last = jnp.minimum((last_m / range_cell_m).astype(jnp.int32), num_ranges)
     is_free = downward & (last_m > first_m) & (last > first)
     beams = scatter(first, is_free, empty)
-    beams = scatter(last, is_free, beams, step=-1)
+    beams = scatter(jnp.maximum(last, 0), -is_free.astype(jnp.int32), beams)
 
     # Clipped, so that the sums over range stay within int16 whatever the sweep repeats.
     hits = jnp.minimum(hits, MAX_HITS // num_ranges)
@@ -232,7 +230,7 @@ def cast_rays(
     there = jnp.any(length >= 0)
     azimuth, du, dv = store(_ray_directions(center, length, width, yaw, num_rays), there)
     enter, leave = store(_ray_stretches(center, length, width, yaw, du, dv), there)
-    met_inside = _sort_rays(evidence, azimuth, enter, leave, range_cell_m, there)
+    met_inside = _sort_rays(evidence, azimuth, enter, leave, range_cell_m)
     crosses, met, free_cells, span = store(met_inside, there)
     total = jnp.maximum(jnp.sum(crosses, axis=-1), 1)
 
@@ -253,12 +251,7 @@ _HIT, _FREE, _DEEP, _OCCLUDED = range(4)
 
 
 def _sort_rays(
-    evidence: Evidence,
-    azimuth: jax.Array,
-    enter: jax.Array,
-    leave: jax.Array,
-    range_cell_m: float,
-    there: jax.Array,
+    evidence: Evidence, azimuth: jax.Array, enter: jax.Array, leave: jax.Array, range_cell_m: float
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """Whether each ray crosses its box, what it met there, its free cells inside, and all its cells there."""
     crosses = (leave > enter) & (enter >= MIN_ENTRY_M)
@@ -268,21 +261,16 @@ def _sort_rays(
     def cell(range_m: jax.Array, extra: int) -> jax.Array:
         return jnp.clip(jnp.trunc(range_m / range_cell_m).astype(jnp.int32) + extra, 0, num_ranges)
 
+    def between(prefix: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+        return lookup(prefix, high, column) - lookup(prefix, low, column)
+
+    near = cell(enter - HIT_BEFORE_M, 0)
+    hit_end = cell(jnp.minimum(enter + HIT_AFTER_M, leave + HIT_BEYOND_M), 1)
+    is_hit = between(evidence.hit, near, hit_end) > 0
+    is_inside = between(evidence.hit, near, cell(leave + DEEP_BEYOND_M, 1)) > 0
     first, last = cell(enter + FREE_AFTER_M, 1), cell(leave - FREE_BEFORE_M, 0)
     span = jnp.where(crosses, jnp.maximum(last - first, 0), 0)
-    ends = (
-        cell(enter - HIT_BEFORE_M, 0),
-        cell(jnp.minimum(enter + HIT_AFTER_M, leave + HIT_BEYOND_M), 1),
-        cell(leave + DEEP_BEYOND_M, 1),
-        first,
-        last,
-    )
-    # Stored, since what a look-up has to work out first does not vectorise.
-    places = store([end * num_azimuths + column for end in ends], there)
-    near, hit_end, deep_end = (lookup(evidence.hit.reshape(-1), place) for place in places[:3])
-    free_before, free_after = (lookup(evidence.free.reshape(-1), place) for place in places[3:])
-    is_hit, is_inside = hit_end - near > 0, deep_end - near > 0
-    free_cells = jnp.where(span > 0, free_after - free_before, 0)
+    free_cells = jnp.where(span > 0, between(evidence.free, first, last), 0)
     blocked = jnp.where(is_inside, _DEEP, _OCCLUDED)
     met = jnp.where(is_hit, _HIT, jnp.where(free_cells > 0, _FREE, blocked))
     return crosses, met, free_cells.astype(jnp.int32), span

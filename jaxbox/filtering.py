@@ -1,15 +1,11 @@
 """Statistical filtering by mean shift and standard deviation (paper, section 3.1)."""
 
 import math
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import compact, masked_mean, masked_std
-
-OCCUPIED_SHARE = 8
-"""A sweep mostly occupies less than this part of the cells: real ones a twentieth."""
+from jaxbox.masked import masked_mean, masked_std
 
 MIN_DENSITY = 1e-6
 """Windows with less weight are empty; the smallest of one point in a corner is exp(-1.5) or so."""
@@ -65,46 +61,25 @@ def filter_outliers(
 
     neighbour_weight = jnp.exp(-0.5 * (cell_m / jnp.asarray(bandwidth_m)) ** 2)
     cells = cell_of(xyz)
-    occupied, sums = _window_sums(xyz, valid, cells, shape, neighbour_weight)
+    window = _window_means(xyz, valid, cells, shape, neighbour_weight)
 
-    def window(cell: jax.Array) -> jax.Array:
-        rows = sums[cell]
-        density = rows[:, 3:]
-        return jnp.concatenate([rows[:, :3] / jnp.maximum(density, MIN_DENSITY), density], axis=1)
+    mode = window
+    for _ in range(num_iterations - 1):
+        there = window[cell_of(mode)]
+        mode = jnp.where(there[:, 3:] > 0, there, mode)
 
-    def shift(cell: jax.Array) -> jax.Array:
-        own = mode = window(cell)
-        for _ in range(num_iterations - 1):
-            there = window(cell_of(mode))
-            mode = jnp.where(there[:, 3:] > 0, there, mode)
-        return jnp.concatenate([mode[:, :3], own[:, 3:]], axis=1)
-
-    end = _of_occupied(shift, occupied)[cells]
+    end = mode[cells]
     distance = jnp.sqrt(sum((xyz[:, axis] - end[:, axis]) ** 2 for axis in range(3)))
     threshold = masked_mean(distance, valid) + num_std * masked_std(distance, valid)
-    return valid & (distance <= threshold) & (end[:, 3] >= min_density)
+    return valid & (distance <= threshold) & (window[cells, 3] >= min_density)
 
 
-def _of_occupied(function: Callable[[jax.Array], jax.Array], occupied: jax.Array) -> jax.Array:
-    """(cells, 4): a function of the occupied cells, zero elsewhere; or of all, where many are occupied."""
-    size = occupied.shape[0]
-    few = max(size // OCCUPIED_SHARE, 1)
-    cell, num = compact(occupied, few)
-
-    def spread() -> jax.Array:
-        return jnp.zeros((size, 4)).at[cell].set(function(jnp.minimum(cell, size - 1)), mode="drop")
-
-    return jax.lax.cond(num <= few, spread, lambda: function(jnp.arange(size)))
-
-
-def _window_sums(
+def _window_means(
     xyz: jax.Array, valid: jax.Array, cells: jax.Array, shape: tuple[int, int, int], weight: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Which cells hold points, and (cells, 4): sums of position (m) and 1 over their 3 x 3 x 3 windows."""
+) -> jax.Array:
+    """(cells, 4): mean position (m) of the 3 x 3 x 3 window of every cell, and its weight."""
     rows = jnp.concatenate([xyz, jnp.ones_like(xyz[:, :1])], axis=1) * valid[:, None]
-    sums = jnp.zeros((math.prod(shape), 4)).at[cells].add(rows)
-    occupied = sums[:, 3] > 0
-    sums = sums.reshape(*shape, 4)
+    sums = jnp.zeros((math.prod(shape), 4)).at[cells].add(rows).reshape(*shape, 4)
     for axis in range(3):
         # The window is a product over the axes: three passes of three taps give all 27.
         padded = jnp.pad(sums, [(1, 1) if a == axis else (0, 0) for a in range(4)])
@@ -112,4 +87,6 @@ def _window_sums(
         before = jax.lax.slice_in_dim(padded, 0, size, axis=axis)
         after = jax.lax.slice_in_dim(padded, 2, size + 2, axis=axis)
         sums = sums + weight * (before + after)
-    return occupied, sums.reshape(-1, 4)
+    sums = sums.reshape(-1, 4)
+    density = sums[:, 3:]
+    return jnp.concatenate([sums[:, :3] / jnp.maximum(density, MIN_DENSITY), density], axis=1)

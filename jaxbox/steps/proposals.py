@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxbox import clustering
 from jaxbox.class_priors import ClassPrior
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import compact, lookup
+from jaxbox.masked import compact
 from jaxbox.steps.common import stage_options
 from jaxbox.steps.points import Obstacles
 from jaxbox.types import Clusters, Label, Rectangles
@@ -119,11 +119,10 @@ def _fitted(cluster: jax.Array, obstacles: Obstacles, num_clusters: int, config:
     in_slab = (obstacles.height > settings.slab_min_height_m) & (
         obstacles.height < settings.slab_max_height_m
     )
-    count = jnp.zeros(num_clusters, jnp.int32)
+    count = jnp.zeros(num_clusters + 1)
     for row in cluster:
-        count = count.at[jnp.where(in_slab, row, num_clusters)].add(1, mode="drop")
-    has_few = count < settings.min_slab_points
-    return (cluster < num_clusters) & (in_slab | lookup(has_few, jnp.minimum(cluster, num_clusters - 1)))
+        count = count.at[row].add(in_slab)
+    return (cluster < num_clusters) & (in_slab | (count[cluster] < settings.min_slab_points))
 
 
 @jax.tree_util.register_dataclass
