@@ -1,5 +1,6 @@
 """Ground removal: RANSAC planes (paper, Algorithm I), and a ground grid for uneven roads."""
 
+import functools
 import math
 from typing import Any
 
@@ -12,11 +13,17 @@ from jaxbox.types import GroundPlane
 CANDIDATE_CELL_M = 1.0
 """Cells whose lowest points are candidates: wide enough that most cells near by see the road."""
 
+FAR_FILL_WIDTH = 4
+"""How much wider the wide Gaussian is, which fills where the narrow one has no ground cell."""
+
 FAR_FILL_WEIGHT = 0.02
 """Weight of the wide Gaussian where the narrow one has no ground cell."""
 
 FAR_FILL_PRIOR = 0.015
 """Weight of the plane itself where the wide Gaussian has none either."""
+
+BAND_CELLS, TILE_CELLS = 24, 64
+"""Gaussians of no longer reach are applied to so many cells at a time; the default's just reach so far."""
 
 GAUSSIAN_TRUNCATION = 3.0
 """Gaussians reach so many standard deviations, as in scipy.ndimage.gaussian_filter(truncate=3)."""
@@ -295,25 +302,54 @@ def _lower_envelope(lowest: jax.Array, step_m: jax.Array | float, num_rounds: in
 
 
 def _smooth(height: jax.Array, weight: jax.Array, sigma_cells: jax.Array | float) -> jax.Array:
-    """Weighted Gaussian mean of the heights, filled from one four times as wide."""
-    wide, narrow = (_gaussian_matrix(height.shape[0], k * sigma_cells) for k in (4, 1))
+    """Weighted Gaussian mean of the heights, filled from one so much wider."""
+    n = height.shape[0]
+    sigmas = [width * sigma_cells for width in (FAR_FILL_WIDTH, 1)]
 
-    def blur(kernel: jax.Array, grid: jax.Array) -> jax.Array:
-        # The Gaussian is separable, and a product with a banded matrix is the fastest convolution here.
-        return jnp.matmul(jnp.matmul(kernel, grid, precision="highest"), kernel.T, precision="highest")
+    def blur_both(tile: int, reach: int) -> list[tuple[jax.Array, jax.Array]]:
+        return [_blur(height, weight, _gaussian_taps(n, sigma), tile, reach) for sigma in sigmas]
 
-    far = blur(wide, height) / (blur(wide, weight) + FAR_FILL_PRIOR)
-    return (blur(narrow, height) + FAR_FILL_WEIGHT * far) / (blur(narrow, weight) + FAR_FILL_WEIGHT)
+    (far_height, far_weight), (near_height, near_weight) = jax.lax.cond(
+        _gaussian_reach(sigmas[0]) <= BAND_CELLS,
+        lambda: blur_both(TILE_CELLS, BAND_CELLS),
+        lambda: blur_both(n, n),
+    )
+    far = far_height / (far_weight + FAR_FILL_PRIOR)
+    return (near_height + FAR_FILL_WEIGHT * far) / (near_weight + FAR_FILL_WEIGHT)
 
 
-def _gaussian_matrix(n: int, sigma: jax.Array | float) -> jax.Array:
-    """(n, n) float32: row i holds the Gaussian taps of cell i; cells beyond the border count as 0."""
+def _blur(
+    height: jax.Array, weight: jax.Array, taps: jax.Array, tile: int, reach: int
+) -> tuple[jax.Array, jax.Array]:
+    """Both grids blurred along both axes; cells beyond the border count as 0.
+
+    The Gaussian is separable, and a product with a banded matrix is the fastest convolution here: tile by
+    tile, since the band is narrow, all tiles with one matrix.
+    """
+    n = height.shape[0]
+    starts = range(0, n, tile)
+    offset = jnp.arange(tile + 2 * reach) - reach - jnp.arange(tile)[:, None]
+    matrix = jnp.where(jnp.abs(offset) < n, taps[jnp.clip(offset + n - 1, 0, 2 * n - 2)], 0)
+    product = functools.partial(jnp.matmul, precision="highest")
+    margin = (reach, reach + -n % tile)
+    rows = jnp.pad(jnp.concatenate([height, weight], axis=1), (margin, (0, 0)))
+    rows = jnp.concatenate([product(matrix, rows[i : i + tile + 2 * reach]) for i in starts])[:n]
+    columns = jnp.pad(jnp.concatenate([rows[:, :n], rows[:, n:]]), ((0, 0), margin))
+    blurred = [product(columns[:, i : i + tile + 2 * reach], matrix.T) for i in starts]
+    blurred = jnp.concatenate(blurred, axis=1)[:, :n]
+    return blurred[:n], blurred[n:]
+
+
+def _gaussian_reach(sigma: jax.Array | float) -> jax.Array:
+    """Cells that a Gaussian reaches to either side."""
+    return jnp.floor(GAUSSIAN_TRUNCATION * sigma + 0.5)
+
+
+def _gaussian_taps(n: int, sigma: jax.Array | float) -> jax.Array:
+    """(2 n - 1,) float32: the Gaussian from n - 1 cells before its middle to as many after."""
     offset = jnp.arange(-(n - 1), n)
-    reach = jnp.floor(GAUSSIAN_TRUNCATION * sigma + 0.5)
-    taps = jnp.where(jnp.abs(offset) <= reach, jnp.exp(-0.5 * (offset / sigma) ** 2), 0)
-    taps = taps / jnp.sum(taps)
-    index = jnp.arange(n)
-    return taps[index[None, :] - index[:, None] + n - 1]
+    taps = jnp.where(jnp.abs(offset) <= _gaussian_reach(sigma), jnp.exp(-0.5 * (offset / sigma) ** 2), 0)
+    return taps / jnp.sum(taps)
 
 
 def surface_height(surface: jax.Array, xy: jax.Array, *, cell_m: float, half_m: float) -> jax.Array:
