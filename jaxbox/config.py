@@ -99,7 +99,7 @@ class GroundConfig:
     """static: the ground grid covers |x|, |y| below this; beyond it its border value holds."""
     num_envelope_rounds: int = _static(default=10)
     """static: cells over which the slope limit spreads."""
-    max_grade: Scalar = 0.1
+    max_grade: Scalar = 0.07
     """Steepest rise of the ground relative to the plane, m/m."""
     band_below_m: Scalar = 0.3
     """Points lower than the plane by more than this, at the sensor, are no ground."""
