@@ -164,8 +164,8 @@ def make_scene(
     Raises:
       ValueError: where so many vehicles find no room, or for an option out of range.
 
-    >>> [v.label.name for v in make_scene(3, num_vehicles=2).vehicles]
-    ['CAR', 'CAR']
+    >>> " ".join(v.label.name for v in make_scene(3, num_vehicles=2).vehicles)
+    'CAR CAR'
     """
     rng = np.random.default_rng((seed, 0))
     road = Road(heading=float(np.radians(rng.normal(0, 3))), center_offset_m=float(rng.uniform(1.5, 2)))

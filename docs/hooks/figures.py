@@ -1,0 +1,146 @@
+"""MkDocs hook: fills ``<!-- table: NAME -->`` from the recorded results and from the code."""
+
+import dataclasses
+import inspect
+import json
+import pathlib
+import re
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import jaxbox
+from jaxbox.types import Counts, Status
+
+RESULTS = pathlib.Path(__file__).parents[2] / "benchmarks" / "results"
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Called by MkDocs for each page."""
+    return re.sub(r"<!-- table: (\w+) -->", lambda match: TABLES[match[1]](), markdown)
+
+
+def load(name: str) -> dict[str, Any]:
+    """One of the recorded results."""
+    return json.loads((RESULTS / f"{name}.json").read_text("utf-8"))
+
+
+def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(cell(value) for value in line) + " |" for line in lines)
+
+
+def cell(value: Any) -> str:
+    """Figures to three places at most."""
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"
+
+
+def made_with(report: dict[str, Any]) -> str:
+    """What a result was measured on."""
+    at = report["circumstances"]
+    machine = f"{at['processor']}, {at['cpus']} cores, jax {at['packages']['jax']}"
+    return f"\n\n*Recorded at commit {at['commit'][:8]}, {machine}.*"
+
+
+def accuracy() -> str:
+    """AP of the presets."""
+    default, paper = load("accuracy_default"), load("accuracy_paper")
+    names = ["bev easy", "bev moderate", "bev hard", "3d easy", "3d moderate", "3d hard"]
+    ceiling = default["copies"]["as recorded"]["ap_ceiling"]
+    rows = [
+        ("default, as recorded", *ap(default["copies"]["as recorded"]["ap"], names)),
+        ("default, mean of copies", *ap(default["summary"]["mean of all"], names)),
+        ("default, deviation", *ap(default["summary"]["sd of all"], names)),
+        ("paper, as recorded", *ap(paper["copies"]["as recorded"]["ap"], names)),
+        ("ceiling", *ap(ceiling, names)),
+    ]
+    return table(["", *names], rows) + made_with(default)
+
+
+def ap(values: dict[str, float], names: Sequence[str]) -> list[float]:
+    """In the order of the header."""
+    return [values[name] for name in names]
+
+
+def sizes() -> str:
+    """Size errors beside the constant row's."""
+    report = load("accuracy_default")["copies"]["as recorded"]
+    names = ["mae", "rmse", "percent", "pearson", "mean_iou"]
+    rows = [(kind, *(values[n] for n in names)) for kind, values in report["sizes"].items()]
+    rows += [(f"{kind}, constant", *(v[n] for n in names)) for kind, v in report["constant_sizes"].items()]
+    return table(["", "MAE m", "RMSE m", "% error", "Pearson", "1D IoU"], rows)
+
+
+def paper_table() -> str:
+    """The paper's table, beside its own figures."""
+    report = load("paper_table")
+    rows = []
+    for preset in ("default", "paper"):
+        pooled = report[preset]["window"]["errors"]["estimated"]["pooled"]
+        rows.append((preset, *(pooled[n] for n in ("mae", "rmse", "percent", "pearson", "mean_iou"))))
+    rows.append(("the paper", 0.167, 0.186, 8.5, 0.9995, 0.936))
+    return table(["", "MAE m", "RMSE m", "% error", "Pearson", "1D IoU"], rows) + made_with(report)
+
+
+def sensors() -> str:
+    """Recall by data set."""
+    report = load("sensors")
+    rows = [
+        (name, *recall.values())
+        for name in ("argoverse2", "pandaset", "semantic_kitti")
+        for recall in [report[name]["recall"]["cars"]]
+    ]
+    return table(["", *report["argoverse2"]["recall"]["cars"]], rows) + made_with(report)
+
+
+def cuts() -> str:
+    """Precision and recall by cut."""
+    rows = load("sensors")["pooled"]["cuts"]
+    return table(list(rows[0]), [list(row.values()) for row in rows])
+
+
+def ground() -> str:
+    """F1 by data set and method."""
+    report = load("ground")
+    means = report["mean_f1"]
+    methods = list(means["semantic_kitti"]["f1"])
+    rows = [(name, *(values["f1"].get(m, "") for m in methods)) for name, values in means.items()]
+    return table(["", *methods], rows) + made_with(report)
+
+
+def speed() -> str:
+    """Whole sweeps and steps."""
+    report = load("detect")
+    rows = [(name, *list(report["whole"][name].values())[:4]) for name in ("detect", "reference")]
+    rows += [(name, *list(values.values())[:4]) for name, values in report.get("steps", {}).items()]
+    return table(["", "min ms", "median ms", "p90 ms", "p99 ms"], rows) + made_with(report)
+
+
+def status() -> str:
+    """Every bit and its sentence."""
+    bits = [bit for bit in Status if bit.value]
+    rows = [(f"`{bit.name}`", bit.value, bit.describe()[0].partition(": ")[2]) for bit in bits]
+    return table(["bit", "value", "what happened, and the mend"], rows)
+
+
+def counts() -> str:
+    """The fields of `Counts` and what they count."""
+    source = inspect.getsource(Counts)
+    texts = dict(re.findall(r'^    (\w+): jax\.Array\n    """(.*?)"""', source, re.MULTILINE | re.DOTALL))
+    rows = [(f"`{f.name}`", " ".join(texts[f.name].split())) for f in dataclasses.fields(jaxbox.types.Counts)]
+    return table(["count", ""], rows)
+
+
+TABLES: dict[str, Callable[[], str]] = {
+    "accuracy": accuracy,
+    "sizes": sizes,
+    "paper": paper_table,
+    "sensors": sensors,
+    "cuts": cuts,
+    "ground": ground,
+    "speed": speed,
+    "status": status,
+    "counts": counts,
+}
