@@ -1,19 +1,24 @@
 """Statistical filtering by mean shift and standard deviation (paper, section 3.1)."""
 
-import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import masked_mean, masked_std
+from jaxbox.masked import apart, compact, masked_mean, masked_std
 
 MIN_DENSITY = 1e-6
 """Windows with less weight are empty; the smallest of one point in a corner is exp(-1.5) or so."""
 
+BLOCK_CELLS = 4
+"""Cells side by side that are shifted together: it is their blocks that are looked for."""
+
+CHUNK_BLOCKS = 1024
+"""Occupied blocks shifted at a time; a sweep of 64 beams has some 1,500 to 3,000."""
+
 
 def filter_outliers(
-    xyz: jax.Array,
-    valid: jax.Array,
+    xyz1: jax.Array,
     *,
     half_x_m: float,
     half_y_m: float,
@@ -27,13 +32,12 @@ def filter_outliers(
     """Keeps the points that lie close to the dense region they shift to.
 
     Each point is shifted to the mean of the points around it, again and again, on a grid: all points
-    of a cell share the Gaussian-weighted mean of the 3 x 3 x 3 cells round it. With d the distance of a
-    point to where its shift ends, the point is an outlier where d > mean(d) + t std(d), or where the
-    weight of its window is below `min_density`.
+    of a cell share the Gaussian-weighted mean of the 3 x 3 x 3 cells round it. A point is an outlier where
+    the weight of its window is below `min_density`, or where d > mean(d) + t std(d), with d the distance of
+    a point to where its shift ends; mean and deviation are those of the other points.
 
     Args:
-      xyz: (N, 3) float32, m, sensor frame; zero where not valid.
-      valid: (N,) bool.
+      xyz1: (N, 4) float32: x, y, z in m, sensor frame, and 1; zero where there is no point.
       half_x_m: static, the grid covers |x| below it.
       half_y_m: static, the grid covers |y| below it.
       cell_m: static, edge of the cells.
@@ -44,49 +48,75 @@ def filter_outliers(
       min_density: least weight of a dense region; a point alone weighs 1.
 
     Returns:
-      (N,) bool: valid and no outlier.
+      (N,) bool: a point, and no outlier.
 
     Reference: paper, section 3.1 and figure 2; oracle `jaxbox.reference.filter_outliers`.
     """
-    shape = (num_levels, round(2 * half_x_m / cell_m), round(2 * half_y_m / cell_m))
-    origin = jnp.array([num_levels * cell_m / 2, half_x_m, half_y_m])
+    num_x, num_y = round(2 * half_x_m / cell_m), round(2 * half_y_m / cell_m)
+    half = (half_x_m, half_y_m, num_levels * cell_m / 2)
+    # A line of cells along y for each x and level, with an empty cell before and some after it. Between the
+    # lines of two x lies an empty one, which is margin to both.
+    stride, margin = num_levels + 1, num_levels + 2
+    width = -(-(num_y + 2) // BLOCK_CELLS) * BLOCK_CELLS
 
     def cell_of(points: jax.Array) -> jax.Array:
-        z_x_y = (points[:, axis] for axis in (2, 0, 1))
-        cell = jnp.zeros(points.shape[0], jnp.int32)
-        for value, start, size in zip(z_x_y, origin, shape, strict=True):
-            index = jnp.floor((value + start) / cell_m).astype(jnp.int32)
-            cell = cell * size + jnp.clip(index, 0, size - 1)
-        return cell
+        x, y, z = (
+            jnp.clip(jnp.floor((points[:, axis] + half[axis]) / cell_m).astype(jnp.int32), 0, size - 1)
+            for axis, size in enumerate((num_x, num_y, num_levels))
+        )
+        # Unsigned: none is counted from the end.
+        return ((x * stride + z + margin) * width + y + 1).astype(jnp.uint32)
 
-    neighbour_weight = jnp.exp(-0.5 * (cell_m / jnp.asarray(bandwidth_m)) ** 2)
-    cells = cell_of(xyz)
-    window = _window_means(xyz, valid, cells, shape, neighbour_weight)
+    valid = xyz1[:, 3] > 0
+    cells = apart(cell_of, xyz1, proof=xyz1[0, 3] >= 0)
+    # One scatter for the sums and the counts: a point is what is added.
+    num_cells = (num_x * stride + 2 * margin) * width
+    sums = jnp.zeros((num_cells, 4)).at[cells].add(xyz1, mode="promise_in_bounds")
+    weight = jnp.exp(-0.5 * (cell_m / jnp.asarray(bandwidth_m)) ** 2)
+    windows = _window_sums(sums.reshape(-1, 4 * width), stride, weight)
 
-    mode = window
-    for _ in range(num_iterations - 1):
-        there = window[cell_of(mode)]
-        mode = jnp.where(there[:, 3:] > 0, there, mode)
+    def window_of(cell: jax.Array) -> jax.Array:
+        row = (cell // width - margin) * (width - 2) + cell % width - 1
+        return windows.reshape(-1, 4).at[row].get(mode="clip")
 
-    end = mode[cells]
-    distance = jnp.sqrt(sum((xyz[:, axis] - end[:, axis]) ** 2 for axis in range(3)))
-    threshold = masked_mean(distance, valid) + num_std * masked_std(distance, valid)
-    return valid & (distance <= threshold) & (window[cells, 3] >= min_density)
+    def shift(cell: jax.Array) -> jax.Array:
+        """Where the points of a cell end; infinitely far if their window is too light."""
+        window = window_of(cell)
+        is_light = window[:, 3:] < min_density
+        for _ in range(num_iterations - 1):
+            window = window_of(cell_of(_mean(window)))
+        return jnp.pad(jnp.where(is_light, jnp.inf, _mean(window)), ((0, 0), (0, 1)))
+
+    ends = _of_occupied(shift, sums).reshape(-1)
+    gap = [xyz1[:, axis] - ends[4 * cells + axis] for axis in range(3)]
+    distance = jnp.sqrt(gap[0] ** 2 + gap[1] ** 2 + gap[2] ** 2)
+    is_dense = valid & (distance < jnp.inf)
+    threshold = masked_mean(distance, is_dense) + num_std * masked_std(distance, is_dense)
+    return is_dense & (distance <= threshold)
 
 
-def _window_means(
-    xyz: jax.Array, valid: jax.Array, cells: jax.Array, shape: tuple[int, int, int], weight: jax.Array
-) -> jax.Array:
-    """(cells, 4): mean position (m) of the 3 x 3 x 3 window of every cell, and its weight."""
-    rows = jnp.concatenate([xyz, jnp.ones_like(xyz[:, :1])], axis=1) * valid[:, None]
-    sums = jnp.zeros((math.prod(shape), 4)).at[cells].add(rows).reshape(*shape, 4)
-    for axis in range(3):
-        # The window is a product over the axes: three passes of three taps give all 27.
-        padded = jnp.pad(sums, [(1, 1) if a == axis else (0, 0) for a in range(4)])
-        size = sums.shape[axis]
-        before = jax.lax.slice_in_dim(padded, 0, size, axis=axis)
-        after = jax.lax.slice_in_dim(padded, 2, size + 2, axis=axis)
-        sums = sums + weight * (before + after)
-    sums = sums.reshape(-1, 4)
-    density = sums[:, 3:]
-    return jnp.concatenate([sums[:, :3] / jnp.maximum(density, MIN_DENSITY), density], axis=1)
+def _mean(window: jax.Array) -> jax.Array:
+    return window[:, :3] / jnp.maximum(window[:, 3:], MIN_DENSITY)
+
+
+def _of_occupied(function: Callable[[jax.Array], jax.Array], sums: jax.Array) -> jax.Array:
+    """(C, 4) a function of the cells that hold points; anything in the others."""
+    size = BLOCK_CELLS * 4
+    blocks = sums.reshape(-1, size)
+    # A product, since it is computed once: the compiler would count again in each reader.
+    count = blocks @ jnp.tile(jnp.array([0.0, 0, 0, 1]), BLOCK_CELLS)
+    occupied, num = compact(count > 0, blocks.shape[0])
+
+    def step(i: jax.Array, ends: jax.Array) -> jax.Array:
+        block = jax.lax.dynamic_slice_in_dim(occupied, i * CHUNK_BLOCKS, min(CHUNK_BLOCKS, blocks.shape[0]))
+        cell = (block[:, None] * BLOCK_CELLS + jnp.arange(BLOCK_CELLS)).reshape(-1)
+        return ends.at[block].set(function(cell).reshape(-1, size), mode="drop")
+
+    return jax.lax.fori_loop(0, (num + CHUNK_BLOCKS - 1) // CHUNK_BLOCKS, step, blocks)
+
+
+def _window_sums(sums: jax.Array, stride: int, weight: jax.Array) -> jax.Array:
+    """Sums over the 3 x 3 x 3 windows of all cells but the margins; one pass along each axis does."""
+    for step in (stride, 1):
+        sums = sums[step:-step] + weight * (sums[: -2 * step] + sums[2 * step :])
+    return sums[:, 4:-4] + weight * (sums[:, :-8] + sums[:, 8:])

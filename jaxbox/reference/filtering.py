@@ -40,8 +40,8 @@ def filter_outliers(
 
     The window of a point is its cell and the 26 cells around, weighted (w, 1, w) along each axis
     with w = exp(-(cell / bandwidth)^2 / 2). A point moves to its window's centroid, then to the
-    centroid of the window there, and so on; d is how far it got. Inliers have
-    d <= mean(d) + num_std std(d) and at least min_density of weight in their own window.
+    centroid of the window there, and so on; d is how far it got. Inliers have at least min_density of
+    weight in their own window, and d <= mean(d) + num_std std(d) over all points with such a window.
 
     Args:
       xyz: (n, 3) finite, m, sensor frame, within the region.
@@ -72,11 +72,12 @@ def filter_outliers(
     )
     mode = centroid[cell_of(xyz)]
     for _ in range(num_iterations - 1):
-        cell = cell_of(mode)
-        mode = np.where(density[cell][:, None] > 0, centroid[cell], mode)
+        mode = centroid[cell_of(mode)]
     distance = np.linalg.norm(xyz - mode, axis=1)
-    near = distance <= distance.mean() + num_std * distance.std()
-    return near & (density[cell_of(xyz)] >= min_density)
+    inlier = density[cell_of(xyz)] >= min_density
+    if inlier.any():
+        inlier &= distance <= distance[inlier].mean() + num_std * distance[inlier].std()
+    return inlier
 
 
 def _window_means(

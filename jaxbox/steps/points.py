@@ -1,13 +1,14 @@
 """From the sweep to the points above the ground."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 
 from jaxbox import filtering, ground
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import compact, take
+from jaxbox.masked import apart, compact, take
 from jaxbox.steps.common import stage_options
 from jaxbox.types import GroundPlane, PointCloud
 
@@ -21,25 +22,40 @@ sweep, by which outliers are told, and beyond 1e19 m its square overflows."""
 class Sweep:
     """The sweep's points: which are finite, in the region, and no outliers."""
 
-    xyz: jax.Array  # (N, 3) m, zero where not valid
+    xyz1: jax.Array  # (N, 4) m and 1, zero where not valid
     num_points: jax.Array  # () of the source sweep, which may exceed N
     present: jax.Array  # (N,) no padding
     finite: jax.Array  # (N,) and finite
     valid: jax.Array  # (N,) and in the region
     inlier: jax.Array  # (N,) and no outlier
 
+    @property
+    def xyz(self) -> jax.Array:
+        """(N, 3) m, zero where not valid."""
+        return self.xyz1[:, :3]
+
 
 def select_points(cloud: PointCloud, config: DetectorConfig) -> Sweep:
     """Picks the finite points in the region, and those of them that are no outliers."""
     region = stage_options(config.region)
-    xyz, present = cloud.xyz1[:, :3], cloud.xyz1[:, 3] > 0
-    finite = present & jnp.all(jnp.isfinite(xyz), axis=1)
-    valid = finite & jnp.all(jnp.abs(xyz) < jnp.array([*region.values(), MAX_ABS_Z_M]), axis=1)
-    xyz = jnp.where(valid[:, None], xyz, 0)
+    limits = (*region.values(), MAX_ABS_Z_M)
+    proof = cloud.num_points >= 0
+    xyz1, present, finite, valid = apart(functools.partial(_in_region, limits), cloud.xyz1, proof=proof)
     inlier = valid
     if config.filtering.enabled:
-        inlier = filtering.filter_outliers(xyz, valid, **region, **stage_options(config.filtering, "enabled"))
-    return Sweep(xyz, cloud.num_points, present, finite, valid, inlier)
+        inlier = filtering.filter_outliers(xyz1, **region, **stage_options(config.filtering, "enabled"))
+    return Sweep(xyz1, cloud.num_points, present, finite, valid, inlier)
+
+
+def _in_region(limits: tuple[float, ...], xyz1: jax.Array) -> tuple[jax.Array, ...]:
+    """The points within the limits, and which are there, are finite, are within."""
+    present = xyz1[:, 3] > 0
+    finite = valid = present
+    # Axis by axis: a reduction over so short a row is slow (XLA, CPU).
+    for axis, limit in enumerate(limits):
+        finite &= jnp.isfinite(xyz1[:, axis])
+        valid &= jnp.abs(xyz1[:, axis]) < limit
+    return jnp.where(valid[:, None], xyz1, 0), present, finite, valid
 
 
 @jax.tree_util.register_dataclass
