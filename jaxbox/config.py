@@ -297,9 +297,6 @@ class VehicleConfig:
     """static: capacity for boxes that pass the gates, before suppression."""
     max_detections: int = _static(default=128)
     """static: K, capacity for boxes in the answer."""
-    max_nearby: int = _static(default=2048)
-    """static: points looked at round a box; where there are more, every so many are and count so
-    many times."""
     margin_m: Scalar = 0.1
     """A point this far outside a box still counts as inside."""
     ring_m: Scalar = 0.5

@@ -291,6 +291,67 @@ def group_by(group: jax.Array, num_groups: int) -> tuple[jax.Array, jax.Array]:
     return order.astype(jnp.int32), jnp.concatenate([jnp.zeros(1, jnp.int32), end])
 
 
+def sort_by_group(
+    read: Callable[[jax.Array], Any], group: jax.Array, num_rows: jax.Array, num_groups: int, *, room: int = 0
+) -> tuple[Any, jax.Array, jax.Array]:
+    """Sorts rows by group, keeping their order within one.
+
+    Args:
+      read: gives the values of rows, a pytree of arrays, by their indices.
+      group: (N,) int32, in [0, num_groups).
+      num_rows: () int32; only the first so many rows count.
+      num_groups: static, K.
+      room: static, rows added at the end.
+
+    Returns:
+      values: pytree of (N + room,) arrays, sorted; anything finite beyond `num_rows`.
+      begin: (K,) int32: group k is rows begin[k] to end[k].
+      end: (K,) int32.
+
+    >>> letters = jnp.array([5, 6, 7])
+    >>> values, begin, end = sort_by_group(lambda i: letters[i], jnp.array([1, 0, 1]), jnp.int32(3), 2)
+    >>> values.tolist(), begin.tolist(), end.tolist()
+    ([6, 5, 7], [0, 1], [1, 3])
+    """
+    size = group.shape[0]
+    num_rows = jnp.minimum(num_rows, size)
+    group = store(jnp.where(jnp.arange(size) < num_rows, group, num_groups), num_rows >= 0)
+    count = jnp.zeros(num_groups, jnp.int32).at[group].add(1, mode="drop")
+    end = prefix_sum(count)
+
+    def place(branch: Callable[..., Any]) -> Callable[..., Any]:
+        return functools.partial(branch, read, room=room)
+
+    values = jax.lax.platform_dependent(
+        group, num_rows, end - count, cpu=place(_place_one_by_one), default=place(_place_sorted)
+    )
+    return values, end - count, end
+
+
+def _place_one_by_one(
+    read: Callable[[jax.Array], Any], group: jax.Array, num_rows: jax.Array, begin: jax.Array, *, room: int
+) -> Any:
+    """Counting sort: XLA compiles so small a loop to native code on the CPU."""
+
+    def step(i: jax.Array, state: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        # The count goes up before it is read: the other way round the whole array would be copied.
+        after, placed = state
+        after = after.at[group[i]].add(1, mode="promise_in_bounds")
+        place = after.at[group[i]].get(mode="promise_in_bounds") - 1
+        return after, jax.tree.map(lambda p, v: p.at[place].set(v, mode="promise_in_bounds"), placed, read(i))
+
+    shapes = jax.eval_shape(read, jax.ShapeDtypeStruct((), jnp.int32))
+    empty = jax.tree.map(lambda s: jnp.zeros(group.shape[0] + room, s.dtype), shapes)
+    return jax.lax.fori_loop(0, num_rows, step, (begin, empty))[1]
+
+
+def _place_sorted(
+    read: Callable[[jax.Array], Any], group: jax.Array, num_rows: jax.Array, begin: jax.Array, *, room: int
+) -> Any:
+    order, _ = group_by(group, begin.shape[0])
+    return jax.tree.map(lambda v: jnp.pad(v, (0, room)), read(order))
+
+
 def _sort_present(words: jax.Array, present: jax.Array) -> jax.Array:
     """Sorts words of which the absent ones are largest and in order: those past the last present one stay."""
     size = words.shape[0]

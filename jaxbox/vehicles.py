@@ -2,12 +2,13 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 
 from jaxbox.geometry import rectangle_iou
-from jaxbox.masked import group_by, map_by_size, map_rows, take
+from jaxbox.masked import map_rows, prefix_sum, sort_by_group
 
 NEARBY_CELL_M = 1.0
 """Points are looked up by cells of this size."""
@@ -15,18 +16,24 @@ NEARBY_CELL_M = 1.0
 MAX_CELL_ROWS = 24
 """Rows of cells round a box: a vehicle of 18 m, the longest that passes the gates, with its ring."""
 
-LOOKUP_STEP = 128
-"""Points looked at in one go."""
+BLOCK_POINTS = 32
+"""Neighbouring points are looked at in blocks of so many."""
 
-COUNT_BITS = 10
-"""Bits that hold a count of up to `LOOKUP_STEP` points."""
+LOOKUP_BLOCKS = 1024
+"""Blocks looked at in one go."""
+
+COUNT_BITS = BLOCK_POINTS.bit_length()
+"""Bits that hold a count of the points of a block."""
+
+NUM_KINDS = 5
+"""Kinds of points that are counted."""
 
 DOUBT_POINTS = 5
 """So many upper points, with the share of full worth behind the faces, are taken for granted: of few
 points the share says little."""
 
-BOX_CHUNK = 32
-"""Boxes looked at together: the loop over their points ends with the one that has most."""
+BOX_CHUNK = 128
+"""Boxes looked at together."""
 
 OVERLAP_CHUNK = 32
 """Rows of the overlap matrix at a time."""
@@ -58,11 +65,10 @@ def count_points_around(
     num_boxes: jax.Array,
     xy: jax.Array,
     height: jax.Array,
-    member: jax.Array,
+    num_points: jax.Array,
     *,
     half_x_m: float,
     half_y_m: float,
-    max_nearby: int,
     margin_m: jax.Array | float,
     ring_m: jax.Array | float,
     upper_height_m: jax.Array | float,
@@ -76,129 +82,134 @@ def count_points_around(
       num_boxes: () int32, rows that hold a box.
       xy: (N, 2) float32, m, all obstacle points.
       height: (N,) float32, m, above the ground.
-      member: (N,) bool.
+      num_points: () int32, rows that hold a point.
       half_x_m: static, points lie within |x| below it.
       half_y_m: static, points lie within |y| below it.
-      max_nearby: static; of more points near a box every so many are looked at, and count so often.
       margin_m: a point this far outside still counts as inside, m.
       ring_m: a point farther out than the margin and nearer than this is in the ring, m.
       upper_height_m: points higher than this are glass, bonnet and roof, m.
 
     Returns:
-      The counts; zero beyond `num_boxes`.
+      The counts; zero for chunks of boxes beyond `num_boxes`.
 
     Reference: oracle `jaxbox.reference.count_points_around`.
     """
     shape = (math.ceil(2 * half_x_m / NEARBY_CELL_M), math.ceil(2 * half_y_m / NEARBY_CELL_M))
-    index = jnp.floor((xy + jnp.array([half_x_m, half_y_m])) / NEARBY_CELL_M).astype(jnp.int32)
-    index = jnp.clip(index, 0, jnp.array(shape) - 1)
-    num_cells = shape[0] * shape[1]
-    order, start = group_by(jnp.where(member, index[:, 0] * shape[1] + index[:, 1], num_cells), num_cells)
-    points = jnp.concatenate([xy, height[:, None]], axis=1)[order]
 
-    first, length = _cell_runs(boxes, start, shape, half_x_m, half_y_m, ring_m)
+    def cell(position: jax.Array, axis: int) -> jax.Array:
+        index = jnp.floor((position + (half_x_m, half_y_m)[axis]) / NEARBY_CELL_M)
+        return jnp.clip(index, 0, shape[axis] - 1).astype(jnp.int32)
 
-    def look(rows: tuple[jax.Array, jax.Array, jax.Array, jax.Array, jax.Array]) -> Surroundings:
-        return _count_runs(*rows, points, max_nearby, margin_m, ring_m, upper_height_m)
+    cell_of_point = cell(xy[:, 0], 0) * shape[1] + cell(xy[:, 1], 1)
 
-    num_steps = (jnp.minimum(jnp.sum(length, axis=1), max_nearby) + LOOKUP_STEP - 1) // LOOKUP_STEP
-    return map_by_size(
-        look,
-        (boxes, count_max_height_m, recess_m, first, length),
-        num_steps,
-        max_size=-(-max_nearby // LOOKUP_STEP),
-        num_rows=num_boxes,
-        chunk=BOX_CHUNK,
+    def read(i: jax.Array) -> list[jax.Array]:
+        return [xy[i, 0], xy[i, 1], height[i]]
+
+    points, begin, end = sort_by_group(
+        read, cell_of_point, num_points, shape[0] * shape[1], room=BLOCK_POINTS
     )
+    frames = _frames(boxes, count_max_height_m, recess_m)
+    reach = jnp.abs(frames[:, 2:4]) * (frames[:, 4:5] + ring_m)
+    reach = reach + jnp.abs(frames[:, 3:1:-1]) * (frames[:, 5:6] + ring_m)
+    low = [cell(boxes[:, axis] - reach[:, axis], axis) for axis in (0, 1)]
+    high = [cell(boxes[:, axis] + reach[:, axis], axis) for axis in (0, 1)]
+
+    def look(rows: tuple[jax.Array, list[jax.Array], list[jax.Array]]) -> Surroundings:
+        frames, low, high = rows
+        i = low[0][:, None] + jnp.arange(MAX_CELL_ROWS)
+        row = jnp.minimum(i, shape[0] - 1) * shape[1]
+        first, after = begin[row + low[1][:, None]], end[row + high[1][:, None]]
+        length = jnp.where(i <= high[0][:, None], after - first, 0)
+        return _count_runs(frames, first, length, points, margin_m, ring_m, upper_height_m)
+
+    return map_rows(look, (frames, low, high), num_rows=num_boxes, chunk=BOX_CHUNK)
 
 
-def _cell_runs(
-    boxes: jax.Array,
-    start: jax.Array,
-    shape: tuple[int, int],
-    half_x_m: float,
-    half_y_m: float,
-    ring_m: jax.Array | float,
-) -> tuple[jax.Array, jax.Array]:
-    """The sorted points near each box, as one run for each row of cells: first and length, (C, rows)."""
-    cos, sin = jnp.abs(jnp.cos(boxes[:, 4])), jnp.abs(jnp.sin(boxes[:, 4]))
-    half_l, half_w = boxes[:, 2] / 2 + ring_m, boxes[:, 3] / 2 + ring_m
-    reach_x, reach_y = cos * half_l + sin * half_w, sin * half_l + cos * half_w
-
-    def cell(position: jax.Array, half: float, size: int) -> jax.Array:
-        return jnp.clip(jnp.floor((position + half) / NEARBY_CELL_M).astype(jnp.int32), 0, size - 1)
-
-    x, y = boxes[:, 0], boxes[:, 1]
-    low_i, high_i = cell(x - reach_x, half_x_m, shape[0]), cell(x + reach_x, half_x_m, shape[0])
-    low_j, high_j = cell(y - reach_y, half_y_m, shape[1]), cell(y + reach_y, half_y_m, shape[1])
-    i = low_i[:, None] + jnp.arange(MAX_CELL_ROWS)
-    row = jnp.minimum(i, shape[0] - 1) * shape[1]
-    first = start[row + low_j[:, None]]
-    end = start[row + high_j[:, None] + 1]
-    return first, jnp.where(i <= high_i[:, None], end - first, 0)
+def _frames(boxes: jax.Array, count_max_height_m: jax.Array, recess_m: jax.Array) -> jax.Array:
+    """(P, 11) what the points round a box are held against, see `_judge`."""
+    x, y, length, width, yaw = boxes.T
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    half_l, half_w = length / 2, width / 2
+    # The sensor at the origin, in the box's frame: it sees the faces on its side of the box.
+    sensor_u, sensor_v = -(x * cos + y * sin), x * sin - y * cos
+    face_u = jnp.where(jnp.abs(sensor_u) > half_l, half_l - recess_m, jnp.inf)
+    face_v = jnp.where(jnp.abs(sensor_v) > half_w, half_w - recess_m, jnp.inf)
+    facing = jnp.sign(sensor_u), jnp.sign(sensor_v)
+    return jnp.stack([x, y, cos, sin, half_l, half_w, *facing, face_u, face_v, count_max_height_m], axis=1)
 
 
 def _count_runs(
-    boxes: jax.Array,
-    count_max_height_m: jax.Array,
-    recess_m: jax.Array,
+    frames: jax.Array,
     first: jax.Array,
     length: jax.Array,
-    points: jax.Array,
-    max_nearby: int,
+    points: Sequence[jax.Array],
     margin_m: jax.Array | float,
     ring_m: jax.Array | float,
     upper_height_m: jax.Array | float,
 ) -> Surroundings:
-    """Counts over the runs of points, every `stride`-th where they are too many."""
-    end = jnp.cumsum(length, axis=1)
-    total = end[:, -1]
-    stride = jnp.maximum((total + max_nearby - 1) // max_nearby, 1)
-    num_looks = (total + stride - 1) // stride
-    cos, sin = jnp.cos(boxes[:, 4])[:, None], jnp.sin(boxes[:, 4])[:, None]
-    half_l, half_w = boxes[:, 2:3] / 2, boxes[:, 3:4] / 2
-    # The sensor at the origin, in the box's frame: it sees the faces on its side of the box.
-    sensor_u = -(boxes[:, :1] * cos + boxes[:, 1:2] * sin)
-    sensor_v = boxes[:, :1] * sin - boxes[:, 1:2] * cos
-    face_u = jnp.where(jnp.abs(sensor_u) > half_l, half_l, jnp.inf)
-    face_v = jnp.where(jnp.abs(sensor_v) > half_w, half_w, jnp.inf)
+    """Counts over runs of neighbouring points, some for each box, (C, runs): block after block of them."""
+    num_boxes, runs = first.shape
+    first, length = first.reshape(-1), length.reshape(-1)
+    num_blocks = (length + BLOCK_POINTS - 1) // BLOCK_POINTS
+    end = prefix_sum(num_blocks)
+    begin = end - num_blocks
 
-    def step(k: jax.Array, state: Surroundings) -> Surroundings:
-        place = (k * LOOKUP_STEP + jnp.arange(LOOKUP_STEP)) * stride[:, None]
-        run = jnp.minimum(jnp.sum(place[:, :, None] >= end[:, None, :], axis=2), MAX_CELL_ROWS - 1)
-        base = jnp.take_along_axis(first - (end - length), run, axis=1)
-        p = take(points, base + place)
-        dx, dy = p[..., 0] - boxes[:, :1], p[..., 1] - boxes[:, 1:2]
-        u, v = dx * cos + dy * sin, dy * cos - dx * sin
-        out_u, out_v = jnp.abs(u) - half_l, jnp.abs(v) - half_w
-        out = jnp.where(place < total[:, None], jnp.maximum(out_u, out_v), jnp.inf)
-        low = p[..., 2] < count_max_height_m[:, None]
-        inside = out < margin_m
-        # A point is of one kind at most, so that one sum counts all three: each has its own bits.
-        kind = jnp.where(inside, jnp.where(low, 1, 1 << COUNT_BITS), 0)
-        kind = jnp.where(~inside & (out < ring_m) & low, 1 << 2 * COUNT_BITS, kind)
-        counts = jnp.sum(kind, axis=1)
-        top = jnp.max(jnp.where(inside & low, p[..., 2], 0), axis=1)
-        upper = inside & low & (p[..., 2] > upper_height_m)
-        depth = jnp.minimum(face_u - jnp.sign(sensor_u) * u, face_v - jnp.sign(sensor_v) * v)
-        recessed = jnp.where(upper & (depth > recess_m[:, None]), 1 << COUNT_BITS, 0)
-        high_counts = jnp.sum(upper + recessed, axis=1)
+    def step(k: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        # The run of each block: that which begins last, before it or with it.
+        place = k * LOOKUP_BLOCKS + jnp.arange(LOOKUP_BLOCKS)
+        present = (num_blocks > 0) & (end > place[0]) & (begin <= place[-1])
+        at = jnp.where(present, jnp.maximum(begin - place[0], 0), LOOKUP_BLOCKS)
+        run = jnp.zeros(LOOKUP_BLOCKS, jnp.int32).at[at].max(jnp.arange(end.shape[0]), mode="drop")
+        run = jax.lax.cummax(run)
+        offset = (place - begin[run]) * BLOCK_POINTS
+        left = jnp.where(place < end[-1], length[run] - offset, 0)
+        box = run // runs
 
-        def add(packed: jax.Array, place: int) -> jax.Array:
-            return stride * ((packed >> place * COUNT_BITS) & (2**COUNT_BITS - 1)).astype(jnp.float32)
+        def block(column: jax.Array) -> jax.Array:
+            def piece(start: jax.Array) -> jax.Array:
+                return jax.lax.dynamic_slice_in_dim(column, start, BLOCK_POINTS)
 
-        return Surroundings(
-            num_inside=state.num_inside + add(counts, 0),
-            top=jnp.maximum(state.top, top),
-            num_above=state.num_above + add(counts, 1),
-            num_ring=state.num_ring + add(counts, 2),
-            num_upper=state.num_upper + add(high_counts, 0),
-            num_recessed=state.num_recessed + add(high_counts, 1),
+            return jax.vmap(piece)(first[run] + offset)
+
+        there = jnp.arange(BLOCK_POINTS) < left[:, None]
+        kinds, top = _judge(
+            frames[box], there, [block(column) for column in points], margin_m, ring_m, upper_height_m
         )
+        counts = (kinds[:, None] >> jnp.arange(NUM_KINDS) * COUNT_BITS) & (2**COUNT_BITS - 1)
+        return state[0].at[box].add(counts), state[1].at[box].max(top)
 
-    zero = jnp.zeros(boxes.shape[0])
-    steps = (jnp.max(num_looks) + LOOKUP_STEP - 1) // LOOKUP_STEP
-    return jax.lax.fori_loop(0, steps, step, Surroundings(*[zero] * len(dataclasses.fields(Surroundings))))
+    steps = (end[-1] + LOOKUP_BLOCKS - 1) // LOOKUP_BLOCKS
+    none = jnp.zeros((num_boxes, NUM_KINDS), jnp.int32), jnp.zeros(num_boxes)
+    counts, top = jax.lax.fori_loop(0, steps, step, none)
+    inside, above, ring, upper, recessed = counts.astype(jnp.float32).T
+    return Surroundings(inside, top, above, ring, upper, recessed)
+
+
+def _judge(
+    frames: jax.Array,
+    there: jax.Array,
+    points: Sequence[jax.Array],
+    margin_m: jax.Array | float,
+    ring_m: jax.Array | float,
+    upper_height_m: jax.Array | float,
+) -> tuple[jax.Array, jax.Array]:
+    """Counts of each kind of point in blocks (B, L) of them, packed in one word, and the highest inside."""
+    box_x, box_y, cos, sin, half_l, half_w, facing_u, facing_v, face_u, face_v, max_height = (
+        frames[:, k, None] for k in range(frames.shape[1])
+    )
+    x, y, height = points
+    dx, dy = x - box_x, y - box_y
+    u, v = dx * cos + dy * sin, dy * cos - dx * sin
+    out = jnp.where(there, jnp.maximum(jnp.abs(u) - half_l, jnp.abs(v) - half_w), jnp.inf)
+    inside, low = out < margin_m, height < max_height
+    upper = inside & low & (height > upper_height_m)
+    recessed = upper & (jnp.minimum(face_u - facing_u * u, face_v - facing_v * v) > 0)
+    # One sum counts all kinds, each in its own bits.
+    kinds = (inside & low, inside & ~low, ~inside & (out < ring_m) & low, upper, recessed)
+    word = sum(jnp.where(kind, 1 << k * COUNT_BITS, 0) for k, kind in enumerate(kinds))
+    # Heights are not negative, and the bits of such numbers are in their order: integers' maxima vectorise.
+    top = jax.lax.bitcast_convert_type(jnp.where(inside & low, height, 0), jnp.int32)
+    return jnp.sum(word, axis=1), jax.lax.bitcast_convert_type(jnp.max(top, axis=1), jnp.float32)
 
 
 def bell(

@@ -121,6 +121,22 @@ def test_both_sorts_of_group_by_are_tried_above():
     assert not packed(2**19, 2**12)
 
 
+@pytest.mark.parametrize("platform", ["cpu", "default"])
+@pytest.mark.parametrize("num_rows", [0, 1, 700, 1000])
+def test_sort_by_group_is_a_stable_sort_of_the_first_rows_on_every_platform(platform, num_rows, monkeypatch):
+    group = np.random.default_rng(num_rows).integers(0, 40, 1000)
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[platform](*args))
+    (rows, minus), begin, end = masked.sort_by_group(
+        lambda i: (i, -i), jnp.asarray(group), jnp.int32(num_rows), 40, room=3
+    )
+    assert rows.shape == minus.shape == (1003,)
+    np.testing.assert_array_equal(rows[:num_rows], np.argsort(group[:num_rows], kind="stable"))
+    np.testing.assert_array_equal(minus[:num_rows], -rows[:num_rows])
+    count = np.bincount(group[:num_rows], minlength=40)
+    np.testing.assert_array_equal(end, np.cumsum(count))
+    np.testing.assert_array_equal(end - begin, count)
+
+
 @pytest.mark.parametrize("all_in", [0, 5])
 def test_group_by_of_one_group_or_none_keeps_the_order(all_in):
     order, start = grouped(np.full(9, all_in), 5)

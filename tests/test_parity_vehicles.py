@@ -38,9 +38,7 @@ HEIGHTS = ("height_m", "height_below_m", "height_above_m", "min_height_m", "max_
 MAX_BOXES = 1024
 NUM_RANDOM = 300
 
-count_points_around = jax.jit(
-    functools.partial(vehicles.count_points_around, **parity.REGION, **AROUND), static_argnames="max_nearby"
-)
+count_points_around = jax.jit(functools.partial(vehicles.count_points_around, **parity.REGION, **AROUND))
 suppress = jax.jit(vehicles.suppress)
 rectangle_iou = jax.jit(jax.vmap(geometry.rectangle_iou))
 
@@ -70,8 +68,7 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
             len(boxes),
             parity.pad(xy, parity.MAX_OBSTACLES),
             parity.pad(height, parity.MAX_OBSTACLES),
-            parity.padded_mask(len(xy), parity.MAX_OBSTACLES),
-            max_nearby=2**15,
+            len(xy),
         )
         around = parity.on_host(around)
         wrong, seen = 0, 0
