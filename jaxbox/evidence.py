@@ -1,10 +1,12 @@
 """What the beams say about a box: hit, seen through or hidden, on a polar grid."""
 
 import dataclasses
+import functools
 import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxbox.masked import lookup, store
 
@@ -23,24 +25,46 @@ FREE_AFTER_M, FREE_BEFORE_M = 0.3, 0.2
 DEEP_BEYOND_M = 0.1
 """A return later than a hit, up to this past the exit, is a deep one: through a window, say."""
 
-MAX_HITS = 32_000
-"""Hits of one azimuth that the sums can hold."""
+BLOCK = 16
+"""Range cells of one word of the evidence: a bit of its low half each; the high half tells of the others."""
+
+NEVER = 2**BLOCK - 1
+"""Range cell of the next hit where there is none."""
 
 MIN_ENTRY_M = 1.0
 """Rays that enter a box nearer than this say nothing: the sensor is all but inside."""
+
+MIN_SLOPE = 1e-9
+"""Rays along a face are taken to run away from it by this."""
+
+
+ARCTAN = (
+    0.00262224281, -0.015132529, 0.0411218476, -0.07366705,
+    0.105739315, -0.141859752, 0.199903966, -0.333329871,
+)  # fmt: skip
+"""(atan t / t - 1) / t^2 as a polynomial of t^2, highest power first: within 1e-8 of atan t on [0, 1]."""
+
+SINE = (2.60005475e-6, -1.98066152e-4, 8.33301729e-3, -0.166666571)
+"""(sin t / t - 1) / t^2 likewise, within 5e-9 of sin t up to a quarter turn."""
+
+COSINE = (-2.60771053e-7, 2.47618862e-5, -1.38884035e-3, 0.0416666407, -0.499999995)
+"""(cos t - 1) / t^2 likewise, within 3e-10 of cos t up to a quarter turn."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """Prefix sums over range, so that any stretch of a ray costs two look-ups."""
+    """Words of 16 range cells on a polar grid: few enough to stay in the cache, one look-up an end."""
 
     free: jax.Array
-    """(R + 1, A) int16: free cells among the first r of each azimuth."""
+    """(B, A) uint32: which cells of a block are free, and, from bit 16 on, how many before the block."""
     hit: jax.Array
-    """(R + 1, A) int16: returns of vehicle height in the first r cells of each azimuth."""
+    """(B, A) uint32: which cells of a block have a return of vehicle height, and, from bit 16 on, the
+    first cell beyond the block that has one, or `NEVER`."""
     support: jax.Array
     """(200, 200) float32: ground points in the 7 x 7 m round each 1 m cell."""
+    num_ranges: int = dataclasses.field(metadata={"static": True})
+    """static, R: range cells of the grid, the last block's being more."""
 
 
 @jax.tree_util.register_dataclass
@@ -104,17 +128,20 @@ def build_evidence(
 
     Reference: oracle `jaxbox.reference.build_evidence`.
     """
-    rho = jnp.hypot(xyz[:, 0], xyz[:, 1])
-    azimuth = azimuth_cell(jnp.arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths)
+    rho = jnp.sqrt(xyz[:, 0] ** 2 + xyz[:, 1] ** 2)
     seen = mask & (rho >= min_range_m)
+    # Stored, or each scatter would work it out again.
+    azimuth = store(azimuth_cell(_arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths), jnp.any(seen))
+    num_blocks = num_ranges // BLOCK + 1
+    size = num_blocks * BLOCK * num_azimuths
 
-    def scatter(range_cell: jax.Array, value: jax.Array, grid: jax.Array) -> jax.Array:
-        return grid.at[range_cell * num_azimuths + azimuth].add(value.astype(jnp.int32), mode="drop")
+    def place(there: jax.Array, range_cell: jax.Array) -> jax.Array:
+        return jnp.where(there, range_cell * num_azimuths + azimuth, size)
 
-    empty = jnp.zeros((num_ranges + 1) * num_azimuths, jnp.int32)
     is_hit = seen & (hit_min_height_m < height) & (height < hit_max_height_m)
+    is_hit = is_hit & (rho < num_ranges * range_cell_m)
     hit_range = (rho / range_cell_m).astype(jnp.int32)
-    hits = scatter(jnp.minimum(hit_range, num_ranges), is_hit & (hit_range < num_ranges), empty)
+    hits = jnp.zeros(size, bool).at[place(is_hit, hit_range)].set(True, mode="drop")
 
     drop = height - sensor_height_m
     downward = seen & (drop < -1e-3)
@@ -126,14 +153,27 @@ def build_evidence(
     first = jnp.minimum((first_m / range_cell_m).astype(jnp.int32) + 1, num_ranges)
     last = jnp.minimum((last_m / range_cell_m).astype(jnp.int32), num_ranges)
     is_free = downward & (last_m > first_m) & (last > first)
-    beams = scatter(first, is_free, empty)
-    beams = scatter(jnp.maximum(last, 0), -is_free.astype(jnp.int32), beams)
+    beams = jnp.zeros(size, jnp.int32).at[place(is_free, first)].add(1, mode="drop")
+    beams = beams.at[place(is_free, last)].add(-1, mode="drop")
 
-    # Clipped, so that the sums over range stay within int16 whatever the sweep repeats.
-    hits = jnp.minimum(hits, MAX_HITS // num_ranges)
-    shape = (num_ranges + 1, num_azimuths)
-    free, hit = _prefix_over_range(beams.reshape(shape), hits.reshape(shape))
-    return Evidence(free, hit, _ground_support(xyz, height, mask, support_height_m))
+    shape = (num_blocks, BLOCK, num_azimuths)
+    return Evidence(
+        free=_free_words(beams.reshape(shape)),
+        hit=_hit_words(hits.reshape(shape)),
+        support=_ground_support(xyz, height, mask, support_height_m),
+        num_ranges=num_ranges,
+    )
+
+
+def _arctan2(y: jax.Array, x: jax.Array) -> jax.Array:
+    """As `jnp.arctan2` to 3e-7 rad; 0 at the origin. That of XLA does not vectorise on a CPU."""
+    near, far = jnp.minimum(jnp.abs(x), jnp.abs(y)), jnp.maximum(jnp.abs(x), jnp.abs(y))
+    ratio = near / jnp.where(far > 0, far, 1)
+    square = ratio**2
+    angle = ratio + ratio * square * _polynomial(ARCTAN, square)
+    angle = jnp.where(jnp.abs(y) > jnp.abs(x), math.pi / 2 - angle, angle)
+    angle = jnp.where(x < 0, math.pi - angle, angle)
+    return jnp.where(y < 0, -angle, angle)
 
 
 def azimuth_cell(azimuth: jax.Array, num_azimuths: int) -> jax.Array:
@@ -154,18 +194,53 @@ def azimuth_cell(azimuth: jax.Array, num_azimuths: int) -> jax.Array:
     return jnp.where(cell < num_azimuths, cell, 0)
 
 
-def _prefix_over_range(beams: jax.Array, hits: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Turns beam starts (+1) and ends (-1) into free cells, and sums them and the hits over range."""
+def _free_words(beams: jax.Array) -> jax.Array:
+    """From how many more beams begin than end in each cell (B, 16, A), what `Evidence.free` holds."""
+    running = _sum_before(sum(beams[:, k] for k in range(BLOCK)))
+    free = jnp.zeros_like(running, jnp.uint32)
+    for k in range(BLOCK):
+        running = running + beams[:, k]
+        free = free | ((running > 0).astype(jnp.uint32) << k)
+    before = _sum_before(jax.lax.population_count(free).astype(jnp.int32))
+    return free | (before.astype(jnp.uint32) << BLOCK)
 
-    def step(carry: tuple[jax.Array, ...], row: tuple[jax.Array, jax.Array]) -> tuple:
-        running, free, hit = carry
-        beam, hit_here = row
-        running = running + beam
-        out = free.astype(jnp.int16), hit.astype(jnp.int16)
-        return (running, free + (running > 0), hit + hit_here), out
 
-    zero = jnp.zeros(beams.shape[1], jnp.int32)
-    return jax.lax.scan(step, (zero, zero, zero), (beams, hits))[1]
+def _sum_before(blocks: jax.Array) -> jax.Array:
+    """Sums of the rows before each row. A scan over few wide rows is the fastest of its kind (XLA, CPU)."""
+    return jax.lax.scan(lambda total, row: (total + row, total), jnp.zeros_like(blocks[0]), blocks)[1]
+
+
+def _hit_words(hits: jax.Array) -> jax.Array:
+    """From which cells have a hit (B, 16, A), what `Evidence.hit` holds."""
+    hit = jnp.zeros((hits.shape[0], hits.shape[2]), jnp.uint32)
+    for k in range(BLOCK):
+        hit = hit | (hits[:, k].astype(jnp.uint32) << k)
+    start = jnp.arange(hits.shape[0], dtype=jnp.uint32)[:, None] * BLOCK
+    first = jnp.where(hit > 0, start + _lowest_bit(hit), NEVER)
+
+    def step(beyond: jax.Array, first: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jnp.minimum(beyond, first), beyond
+
+    beyond = jax.lax.scan(step, jnp.full_like(first[0], NEVER), first, reverse=True)[1]
+    return hit | (beyond << BLOCK)
+
+
+def flagged_cells(words: jax.Array | np.ndarray) -> np.ndarray:
+    """Which cells the words of `Evidence` flag, as free or as hit, for pictures and tests.
+
+    Args:
+      words: (B, A) uint32.
+
+    Returns:
+      (16 B, A) bool, by range and azimuth.
+    """
+    bits = np.asarray(words)[:, None] >> np.arange(BLOCK, dtype=np.uint32)[:, None]
+    return (bits & 1).astype(bool).reshape(-1, words.shape[1])
+
+
+def _lowest_bit(word: jax.Array) -> jax.Array:
+    """Place of the lowest bit of words that are not zero."""
+    return jax.lax.population_count((word & -word) - 1)
 
 
 def _ground_support(
@@ -173,14 +248,14 @@ def _ground_support(
 ) -> jax.Array:
     n = round(2 * SUPPORT_HALF_M)
     i, j = (jnp.clip(jnp.floor(xyz[:, a] + SUPPORT_HALF_M).astype(jnp.int32), 0, n - 1) for a in (0, 1))
-    on_ground = (mask & (jnp.abs(height) < support_height_m)).astype(jnp.float32)
-    count = jnp.zeros(n * n).at[i * n + j].add(on_ground).reshape(n, n)
+    on_ground = mask & (jnp.abs(height) < support_height_m)
+    place = jnp.where(on_ground, i * n + j, n * n)
+    count = jnp.zeros(n * n, jnp.int32).at[place].add(1, mode="drop").reshape(n, n)
     for axis in (0, 1):
         pad = [(SUPPORT_REACH, SUPPORT_REACH) if a == axis else (0, 0) for a in (0, 1)]
         padded = jnp.pad(count, pad)
-        slices = [jax.lax.slice_in_dim(padded, k, k + n, axis=axis) for k in range(2 * SUPPORT_REACH + 1)]
-        count = jnp.sum(jnp.stack(slices), axis=0)
-    return count
+        count = sum(jax.lax.slice_in_dim(padded, k, k + n, axis=axis) for k in range(2 * SUPPORT_REACH + 1))
+    return count.astype(jnp.float32)
 
 
 def ground_support(evidence: Evidence, xy: jax.Array) -> jax.Array:
@@ -227,92 +302,117 @@ def cast_rays(
 
     Reference: oracle `jaxbox.reference.box_evidence`.
     """
+    shape = length.shape
+    length, width, yaw = (a.reshape(-1) for a in (length, width, yaw))
     there = jnp.any(length >= 0)
-    azimuth, du, dv = store(_ray_directions(center, length, width, yaw, num_rays), there)
-    enter, leave = store(_ray_stretches(center, length, width, yaw, du, dv), there)
-    met_inside = _sort_rays(evidence, azimuth, enter, leave, range_cell_m)
-    crosses, met, free_cells, span = store(met_inside, there)
-    total = jnp.maximum(jnp.sum(crosses, axis=-1), 1)
-
-    def share(kind: int) -> jax.Array:
-        return jnp.sum(crosses & (met == kind), axis=-1) / total
-
-    free_length = jnp.sum(free_cells, axis=-1) / jnp.maximum(jnp.sum(span, axis=-1), 1)
+    rays = store(_ray_stretches(center.reshape(-1, 2), length, width, yaw, num_rays), there)
+    met = store(_sort_rays(evidence, *rays, range_cell_m, there), there)
+    hit, free, deep, crosses, free_cells, cells = (jnp.sum(a, axis=0).reshape(shape) for a in met)
+    total = jnp.maximum(crosses, 1)
     return RayFractions(
-        hit=share(_HIT),
-        free=share(_FREE),
-        deep=share(_DEEP),
-        occluded=share(_OCCLUDED),
-        free_length=free_length,
+        hit=hit / total,
+        free=free / total,
+        deep=deep / total,
+        occluded=(crosses - hit - free - deep) / total,
+        free_length=free_cells / jnp.maximum(cells, 1),
     )
 
 
-_HIT, _FREE, _DEEP, _OCCLUDED = range(4)
+def _ray_stretches(
+    center: jax.Array, length: jax.Array, width: jax.Array, yaw: jax.Array, num_rays: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Azimuth of rays over boxes, and the ranges at which they enter and leave, each (num_rays, boxes).
+
+    In the box's frame, with the sensor at the origin, the box is |u - u0| < length / 2 and
+    |v - v0| < width / 2: the slab test. A ray that leaves before it enters misses.
+    """
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    x, y = center[:, 0], center[:, 1]
+    u0, v0 = x * cos + y * sin, y * cos - x * sin
+    rho = jnp.maximum(jnp.sqrt(x**2 + y**2), 1e-6)
+    # The corners' azimuths, from that of the middle on.
+    corners = [(u0 + a * length / 2, v0 + b * width / 2) for a in (-1, 1) for b in (-1, 1)]
+    spread = [_arctan2(u0 * v - v0 * u, u0 * u + v0 * v) for u, v in corners]
+    low, high = functools.reduce(jnp.minimum, spread), functools.reduce(jnp.maximum, spread)
+    middle, half = (low + high) / 2, (high - low) / 2
+    turn, tilt = jnp.cos(middle), jnp.sin(middle)
+    along, across = (u0 * turn - v0 * tilt) / rho, (v0 * turn + u0 * tilt) / rho
+    # Half a turn at most, as seen from outside the box: from inside, any direction leads out.
+    offset = ((2 * jnp.arange(num_rays) + 1) / num_rays - 1)[:, None] * half
+    cos, sin = _cos_sin(offset)
+    enter_u, leave_u = _slab(u0, along * cos - across * sin, length / 2)
+    enter_v, leave_v = _slab(v0, across * cos + along * sin, width / 2)
+    azimuth = _arctan2(y, x) + middle + offset
+    return azimuth, jnp.maximum(enter_u, enter_v), jnp.minimum(leave_u, leave_v)
+
+
+def _cos_sin(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Of angles up to a quarter turn, to 1e-7; those of XLA do not vectorise on a CPU."""
+    square = angle**2
+    return 1 + square * _polynomial(COSINE, square), angle + angle * square * _polynomial(SINE, square)
+
+
+def _polynomial(coefficients: tuple[float, ...], x: jax.Array) -> jax.Array:
+    total = jnp.full_like(x, coefficients[0])
+    for coefficient in coefficients[1:]:
+        total = total * x + coefficient
+    return total
+
+
+def _slab(middle: jax.Array, direction: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
+    # A ray along the face: any tiny slope has it wholly within, or wholly outside, the slab.
+    inverse = 1 / jnp.where(jnp.abs(direction) > MIN_SLOPE, direction, MIN_SLOPE)
+    a, b = (middle - half) * inverse, (middle + half) * inverse
+    return jnp.minimum(a, b), jnp.maximum(a, b)
 
 
 def _sort_rays(
-    evidence: Evidence, azimuth: jax.Array, enter: jax.Array, leave: jax.Array, range_cell_m: float
-) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
-    """Whether each ray crosses its box, what it met there, its free cells inside, and all its cells there."""
+    evidence: Evidence,
+    azimuth: jax.Array,
+    enter: jax.Array,
+    leave: jax.Array,
+    range_cell_m: float,
+    there: jax.Array,
+) -> tuple[jax.Array, ...]:
+    """Whether each ray hit, was free, was deep, crossed at all; its free cells inside, and all there."""
+    num_azimuths = evidence.free.shape[1]
     crosses = (leave > enter) & (enter >= MIN_ENTRY_M)
-    num_ranges, num_azimuths = evidence.free.shape[0] - 1, evidence.free.shape[1]
-    column = azimuth_cell(azimuth, num_azimuths)
+    # Any range will do where the ray misses.
+    enter, leave = jnp.where(crosses, enter, MIN_ENTRY_M), jnp.where(crosses, leave, MIN_ENTRY_M)
 
     def cell(range_m: jax.Array, extra: int) -> jax.Array:
-        return jnp.clip(jnp.trunc(range_m / range_cell_m).astype(jnp.int32) + extra, 0, num_ranges)
+        return jnp.clip((range_m / range_cell_m).astype(jnp.int32) + extra, 0, evidence.num_ranges)
 
-    def between(prefix: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
-        return lookup(prefix, high, column) - lookup(prefix, low, column)
-
-    near = cell(enter - HIT_BEFORE_M, 0)
-    hit_end = cell(jnp.minimum(enter + HIT_AFTER_M, leave + HIT_BEYOND_M), 1)
-    is_hit = between(evidence.hit, near, hit_end) > 0
-    is_inside = between(evidence.hit, near, cell(leave + DEEP_BEYOND_M, 1)) > 0
-    first, last = cell(enter + FREE_AFTER_M, 1), cell(leave - FREE_BEFORE_M, 0)
-    span = jnp.where(crosses, jnp.maximum(last - first, 0), 0)
-    free_cells = jnp.where(span > 0, between(evidence.free, first, last), 0)
-    blocked = jnp.where(is_inside, _DEEP, _OCCLUDED)
-    met = jnp.where(is_hit, _HIT, jnp.where(free_cells > 0, _FREE, blocked))
-    return crosses, met, free_cells.astype(jnp.int32), span
-
-
-def _ray_directions(
-    center: jax.Array, length: jax.Array, width: jax.Array, yaw: jax.Array, num_rays: int
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Azimuth of the rays over a box, and their directions in its frame, each (..., num_rays)."""
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    x, y = center[..., 0], center[..., 1]
-    middle = jnp.arctan2(y, x)
-    side_l, side_w = jnp.array([1.0, 1.0, -1.0, -1.0]), jnp.array([1.0, -1.0, 1.0, -1.0])
-    along, across = side_l * length[..., None] / 2, side_w * width[..., None] / 2
-    corner_x = x[..., None] + cos[..., None] * along - sin[..., None] * across
-    corner_y = y[..., None] + sin[..., None] * along + cos[..., None] * across
-    spread = jnp.arctan2(corner_y, corner_x) - middle[..., None]
-    spread = spread - 2 * math.pi * jnp.round(spread / (2 * math.pi))
-    low, high = jnp.min(spread, axis=-1), jnp.max(spread, axis=-1)
-    fraction = (jnp.arange(num_rays) + 0.5) / num_rays
-    azimuth = middle[..., None] + low[..., None] + (high - low)[..., None] * fraction
-    return azimuth, jnp.cos(azimuth - yaw[..., None]), jnp.sin(azimuth - yaw[..., None])
+    near, first = cell(enter - HIT_BEFORE_M, 0), cell(enter + FREE_AFTER_M, 1)
+    last = jnp.maximum(cell(leave - FREE_BEFORE_M, 0), first)
+    column = azimuth_cell(azimuth, num_azimuths)
+    # Stored, since what a look-up has to work out first does not vectorise.
+    ends = store((near, first, last), there)
+    near_word, first_word, last_word = (
+        lookup(table.reshape(-1), place)
+        for table, place in zip(
+            (evidence.hit, evidence.free, evidence.free),
+            store([end // BLOCK * num_azimuths + column for end in ends], there),
+            strict=True,
+        )
+    )
+    met_at = _next_hit(near_word, near)
+    is_hit = crosses & (met_at < cell(jnp.minimum(enter + HIT_AFTER_M, leave + HIT_BEYOND_M), 1))
+    cells = jnp.where(crosses, last - first, 0)
+    free_cells = jnp.where(crosses, _free_before(last_word, last) - _free_before(first_word, first), 0)
+    is_free = ~is_hit & (free_cells > 0)
+    is_deep = crosses & ~is_hit & ~is_free & (met_at < cell(leave + DEEP_BEYOND_M, 1))
+    return is_hit, is_free, is_deep, crosses, free_cells, cells
 
 
-def _ray_stretches(
-    center: jax.Array, length: jax.Array, width: jax.Array, yaw: jax.Array, du: jax.Array, dv: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """Entry and exit range of rays over a box, each (..., num_rays); exit < entry: a miss.
-
-    In the box's frame the box is |u| < length / 2, |v| < width / 2: the slab test.
-    """
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    x, y = center[..., 0], center[..., 1]
-    origin_u, origin_v = -(x * cos + y * sin), x * sin - y * cos
-    enter_u, leave_u = _slab(origin_u[..., None], du, length[..., None] / 2)
-    enter_v, leave_v = _slab(origin_v[..., None], dv, width[..., None] / 2)
-    return jnp.maximum(enter_u, enter_v), jnp.minimum(leave_u, leave_v)
+def _next_hit(word: jax.Array, cell: jax.Array) -> jax.Array:
+    """Range cell of the first hit in a cell or beyond, from the word of its block in `Evidence.hit`."""
+    bit = (cell % BLOCK).astype(jnp.uint32)
+    rest = (word & NEVER) >> bit
+    return jnp.where(rest > 0, cell + _lowest_bit(rest).astype(jnp.int32), (word >> BLOCK).astype(jnp.int32))
 
 
-def _slab(origin: jax.Array, direction: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
-    parallel = jnp.abs(direction) < 1e-9
-    safe = jnp.where(parallel, 1.0, direction)
-    a, b = (-half - origin) / safe, (half - origin) / safe
-    far = jnp.float32(1e9)
-    return jnp.where(parallel, -far, jnp.minimum(a, b)), jnp.where(parallel, far, jnp.maximum(a, b))
+def _free_before(word: jax.Array, cell: jax.Array) -> jax.Array:
+    """How many cells before one are free, from the word of its block in `Evidence.free`."""
+    below = (jnp.uint32(1) << (cell % BLOCK).astype(jnp.uint32)) - 1
+    return ((word >> BLOCK) + jax.lax.population_count(word & below)).astype(jnp.int32)

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxbox import reference, synthetic
 from jaxbox.config import ComponentMap, DetectorConfig
-from jaxbox.evidence import Evidence
+from jaxbox.evidence import BLOCK, Evidence, _free_words, _hit_words
 from jaxbox.reference.proposals import (
     Obstacles,
     Proposal,
@@ -55,6 +55,12 @@ def pad(rows, capacity, fill=0):
     out = np.full((capacity, *rows.shape[1:]), fill, dtype)
     out[: len(rows)] = rows
     return jnp.asarray(out)
+
+
+def flagged(sums):
+    """(A, B * BLOCK) bool: which range cells count, from the reference's sums of those before."""
+    cells = np.diff(sums, axis=1, append=sums[:, -1:]) > 0
+    return np.pad(cells, [(0, 0), (0, -cells.shape[1] % BLOCK)])
 
 
 def on_host(tree):
@@ -135,11 +141,17 @@ class Case:
 
     def evidence_as_input(self) -> Evidence:
         """The reference's evidence in the layout of the compiled stages."""
-        seen = self.evidence
+        free, hits = (
+            jnp.asarray(flagged(sums).T).reshape(-1, BLOCK, len(sums))
+            for sums in (self.evidence.free_sums, self.evidence.hit_sums)
+        )
+        # Where each free cell ends, the next begins: the compiled stage sums the two.
+        changes = jnp.diff(free.reshape(-1, free.shape[2]).astype(jnp.int32), axis=0, prepend=0)
         return Evidence(
-            free=jnp.asarray(seen.free_sums.T, jnp.int16),
-            hit=jnp.asarray(seen.hit_sums.T, jnp.int16),
-            support=jnp.asarray(seen.support, jnp.float32),
+            free=_free_words(changes.reshape(free.shape)),
+            hit=_hit_words(hits),
+            support=jnp.asarray(self.evidence.support, jnp.float32),
+            num_ranges=CONFIG.evidence.num_ranges,
         )
 
     @functools.cached_property
