@@ -1,7 +1,9 @@
 """jaxbox: training-free LiDAR vehicle detection as one compiled JAX function."""
 
+from jaxbox.batching import detect_batch
 from jaxbox.config import DEFAULT_CUT, DetectorConfig
 from jaxbox.detector import detect
+from jaxbox.streaming import StreamedSweep, stream
 from jaxbox.types import Calibration, Detections, GroundPlane, Hulls, Label, PointCloud, Status, stack_clouds
 from jaxbox.version import __version__
 
@@ -15,7 +17,10 @@ __all__ = [
     "Label",
     "PointCloud",
     "Status",
+    "StreamedSweep",
     "__version__",
     "detect",
+    "detect_batch",
     "stack_clouds",
+    "stream",
 ]

@@ -18,8 +18,8 @@ def detect(
 
     One jitted function of fixed shape: it compiles once for each capacity and set of static settings, and
     never again when sweeps change length or thresholds move. `jax.vmap` it over a batch of clouds, of
-    configurations or of keys: the batch gives the singles' answers, but for the last bits
-    of float32.
+    configurations or of keys: the batch gives the singles' answers, bit for bit. `detect_batch`
+    spreads a list of clouds over devices.
 
     Args:
       cloud: one sweep, see `PointCloud.from_numpy`.
@@ -54,8 +54,8 @@ def _as_float(threshold: Any) -> Any:
 
 
 # A batch runs its sweeps one after the other: on a CPU, batched scatters, and loops that end with the
-# largest sweep of the batch, cost more than they save. Inside the loop the compiler may order float32
-# arithmetic otherwise.
+# largest sweep of the batch, cost more than they save. Each step stands behind a wall, see `apart`, so
+# that the compiler makes the same code of it in the loop and without, and the batch has the singles' bits.
 @jax.jit
 @jax.custom_batching.sequential_vmap
 def _detect_jit(cloud: PointCloud, config: DetectorConfig, key: jax.Array) -> Detections:

@@ -18,8 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-CAPACITY_BUCKETS: tuple[int, ...] = tuple(2**k for k in range(14, 21))
-"""Point capacities that `PointCloud.from_numpy` pads to: 16,384 to 1,048,576. One compile a bucket."""
+from jaxbox.padding import aligned_zeros, checked_points, fill_rows, fitting_capacity
 
 
 class Status(enum.IntFlag):
@@ -115,49 +114,14 @@ class PointCloud:
         >>> PointCloud.from_numpy(np.zeros((5, 3), np.float32)).capacity
         16384
         """
-        xyz, intensity = _checked_points(xyz, intensity)
-        if capacity is None:
-            buckets = [b for b in CAPACITY_BUCKETS if b >= len(xyz)]
-            capacity = buckets[0] if buckets else CAPACITY_BUCKETS[-1]
+        xyz, intensity = checked_points(xyz, intensity)
+        capacity = fitting_capacity(len(xyz)) if capacity is None else capacity
         if capacity < 1:
             raise ValueError(f"capacity is {capacity}; it must be at least 1.")
-        num_points = len(xyz)
-        if num_points > capacity:
-            keep = _nearest(xyz, capacity)
-            xyz, intensity = xyz[keep], intensity[keep]
-        rows = np.zeros((capacity, 4), np.float32)
-        rows[: len(xyz), :3] = xyz
-        rows[: len(xyz), 3] = 1
-        padded = np.zeros(capacity, np.float32)
-        padded[: len(xyz)] = intensity
-        return cls(jnp.asarray(rows), jnp.asarray(padded), jnp.int32(num_points))
-
-
-def _checked_points(xyz: np.ndarray, intensity: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    xyz = np.asarray(xyz)
-    if xyz.ndim != 2 or xyz.shape[1] != 3:
-        raise ValueError(
-            f"xyz has shape {xyz.shape}; it must be (n, 3). Pass points[:, :3] of a wider array."
-        )
-    if intensity is None:
-        intensity = np.zeros(len(xyz), np.float32)
-    intensity = np.asarray(intensity)
-    if intensity.shape != (len(xyz),):
-        raise ValueError(f"intensity has shape {intensity.shape}; it must be ({len(xyz)},), one a point.")
-    for name, array in (("xyz", xyz), ("intensity", intensity)):
-        if array.dtype.kind not in "fiu":
-            raise ValueError(f"{name} has dtype {array.dtype}; it must be real numbers.")
-    # A float64 beyond float32's range becomes infinite here, and is counted as non-finite later.
-    with np.errstate(over="ignore"):
-        return xyz.astype(np.float32), intensity.astype(np.float32)
-
-
-def _nearest(xyz: np.ndarray, count: int) -> np.ndarray:
-    """Indices, ascending, of the `count` points nearest to the sensor; non-finite ones go first."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        distance = np.linalg.norm(xyz.astype(np.float64), axis=1)
-    distance = np.where(np.isfinite(distance), distance, np.inf)
-    return np.sort(np.argsort(distance, kind="stable")[:count])
+        rows, padded = aligned_zeros((capacity, 4)), aligned_zeros((capacity,))
+        fill_rows(xyz, intensity, rows, padded)
+        # Nobody else holds these arrays, so JAX may use them as they are.
+        return cls(jax.device_put(rows), jax.device_put(padded), jnp.int32(len(xyz)))
 
 
 def stack_clouds(clouds: Sequence[PointCloud]) -> PointCloud:

@@ -17,6 +17,8 @@ def pytest_configure(config: pytest.Config) -> None:
     """
     folder = os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(config.cache.mkdir("jax")))
     jax.config.update("jax_compilation_cache_dir", folder)
+    # Two, so that work over several devices can be tested; the first is the default as ever.
+    jax.config.update("jax_num_cpu_devices", 2)
 
 
 @pytest.fixture(scope="session")

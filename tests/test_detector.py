@@ -50,14 +50,6 @@ def assert_same_bits(one, other):
         np.testing.assert_array_equal(a, b)
 
 
-def assert_same_but_for_rounding(one, other):
-    """The compiler may order float32 arithmetic otherwise within a batch; nothing else may differ."""
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_allclose(
-            a, b, rtol=1e-5 if a.dtype.kind == "f" else 0, atol=2e-5 if a.dtype.kind == "f" else 0
-        )
-
-
 def assert_well_formed(detections, num_points, capacity=CAPACITY):
     """What holds of every answer, whatever the sweep."""
     d, valid, counts = detections, detections.valid, detections.counts
@@ -146,7 +138,7 @@ def test_twice_the_padding_gives_the_same_boxes_bit_for_bit(seed):
     np.testing.assert_allclose(wide.hulls.vertices, narrow.hulls.vertices, atol=slice_m)
 
 
-def test_a_batch_of_sweeps_thresholds_and_keys_gives_the_answers_of_the_singles():
+def test_a_batch_of_sweeps_thresholds_and_keys_gives_the_bits_of_the_singles():
     sweeps = [street(0).xyz, np.zeros((0, 3)), street(1).xyz, street(0).xyz]
     scales = (1.0, 0.8, 1.3, 0.9)
     configs = [jax.tree.map(lambda v, s=scale: s * v, DetectorConfig()) for scale in scales]
@@ -156,7 +148,7 @@ def test_a_batch_of_sweeps_thresholds_and_keys_gives_the_answers_of_the_singles(
     many = jax.device_get(jax.vmap(detect)(clouds, batch, keys))
     for row, (xyz, config, key) in enumerate(zip(sweeps, configs, keys, strict=True)):
         single = run(xyz, config=config, key=key)
-        assert_same_but_for_rounding(jax.tree.map(lambda leaf, row=row: leaf[row], many), single)
+        assert_same_bits(jax.tree.map(lambda leaf, row=row: leaf[row], many), single)
     assert len(set(many.valid.sum(axis=1))) == len(sweeps)
 
 

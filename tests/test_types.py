@@ -22,8 +22,8 @@ from jaxbox.config import (
     HullConfig,
     VehicleConfig,
 )
+from jaxbox.padding import CAPACITY_BUCKETS
 from jaxbox.synthetic import make_sweep
-from jaxbox.types import CAPACITY_BUCKETS
 
 POINTS = np.random.default_rng(0).normal(0, 20, (50, 3)).astype(np.float32)
 

@@ -9,7 +9,7 @@ from rich.table import Table
 
 from jaxbox.cli.cache import CACHE_VARIABLE, enable_cache
 from jaxbox.config import DetectorConfig
-from jaxbox.types import CAPACITY_BUCKETS
+from jaxbox.padding import CAPACITY_BUCKETS
 from jaxbox.version import __version__
 
 PACKAGES = ("jax", "jaxlib", "numpy", "opencv-python-headless", "chex", "matplotlib", "scipy")

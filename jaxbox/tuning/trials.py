@@ -11,10 +11,11 @@ from jaxbox.config import DetectorConfig
 from jaxbox.detector import detect
 from jaxbox.evaluation.copies import Copy, Frame, detect_copy
 from jaxbox.evaluation.objectives import Matched, Objective
+from jaxbox.padding import fitting_capacity
 from jaxbox.settings import replace_settings
 from jaxbox.tuning.selection import Trial, score_without
 from jaxbox.tuning.space import Changes
-from jaxbox.types import CAPACITY_BUCKETS, PointCloud, Status
+from jaxbox.types import PointCloud, Status
 
 
 def _nothing() -> None:
@@ -40,7 +41,7 @@ class Bench:
     def capacity(self) -> int:
         """Points that every sweep is padded to: one for all, so that there is one compile."""
         most = max(len(frame.xyz) for frame in self.frames)
-        return min((size for size in CAPACITY_BUCKETS if size >= most), default=CAPACITY_BUCKETS[-1])
+        return fitting_capacity(most)
 
     @property
     def sweeps_per_trial(self) -> int:

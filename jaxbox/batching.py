@@ -1,0 +1,55 @@
+"""detect_batch(): many sweeps over all devices, each by the program that a single one takes."""
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+
+from jaxbox.config import DetectorConfig
+from jaxbox.detector import detect
+from jaxbox.types import Detections, PointCloud
+
+
+def detect_batch(
+    clouds: Sequence[PointCloud],
+    config: DetectorConfig | None = None,
+    key: jax.Array | None = None,
+    devices: Sequence[Any] | None = None,
+) -> list[Detections]:
+    """Finds the vehicles of many sweeps, over several devices at once.
+
+    The devices take turns, and each runs `detect` as for a single sweep: the same program, so the same bits,
+    and no more compiles than one a device and capacity. Calls are dispatched without waiting: while a
+    device works, the next sweeps are sent to the others.
+
+    Several devices of a CPU have to be asked for before JAX starts:
+    ``jax.config.update("jax_num_cpu_devices", 2)``.
+
+    Args:
+      clouds: any number, of any capacities.
+      config: the settings of all; None for the default preset.
+      key: the JAX random key of all; None for `jax.random.key(0)`.
+      devices: JAX devices to compute on; None for all of this process.
+
+    Returns:
+      The detections of each sweep in the order of the clouds, as `detect(cloud, config, key)` gives them,
+      each on its device. They may still be computing.
+
+    Raises:
+      ValueError: for no devices, or settings that contradict each other.
+    """
+    devices = jax.local_devices() if devices is None else devices
+    if not devices:
+        raise ValueError("devices is empty; name at least one, or leave it out for all of this process.")
+    turns = itertools.islice(itertools.cycle(devices), len(clouds))
+    return [_detect_on(device, cloud, config, key) for device, cloud in zip(turns, clouds, strict=True)]
+
+
+def _detect_on(
+    device: Any, cloud: PointCloud, config: DetectorConfig | None, key: jax.Array | None
+) -> Detections:
+    # An array that was put on a device is tied to it, and JAX compiles anew for it even where it already was.
+    if device not in cloud.xyz1.devices():
+        cloud, key = jax.device_put((cloud, key), device)
+    return detect(cloud, config, key)

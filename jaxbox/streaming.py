@@ -1,0 +1,254 @@
+"""stream(): recorded sweeps through the detector, the next one read while one is computed."""
+
+import collections
+import concurrent.futures
+import dataclasses
+import itertools
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future
+from concurrent.futures.process import BrokenProcessPool
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbox.config import DetectorConfig
+from jaxbox.detector import detect
+from jaxbox.padding import aligned_zeros, checked_points, fill_rows, fitting_capacity
+from jaxbox.steps import check_settings
+from jaxbox.types import Detections, PointCloud
+
+NUM_BUFFERS = 3
+"""One sweep is computed, one has been read, and one is being read."""
+
+THREADS_VARIABLE = "NPROC"
+"""Environment variable by which XLA is told how many threads a process may take."""
+
+
+class ReadableSweep(Protocol):
+    """What `stream` asks of a sweep; `jaxbox.io.Sweep` has it."""
+
+    @property
+    def name(self) -> str:
+        """Of the sweep, for the results."""
+        ...
+
+    def read_points(self) -> tuple[np.ndarray, np.ndarray | None]:
+        """Reads (n, 3) x, y, z in m and (n,) intensity, or None for the latter."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class StreamedSweep:
+    """One sweep that went through, or did not."""
+
+    name: str
+    """Of the sweep."""
+    num_points: int
+    """Points of the sweep; 0 where it could not be read."""
+    detections: Detections | None
+    """What was found, in arrays of the host; None where the sweep failed."""
+    error: str | None
+    """Why the sweep failed; None where it did not."""
+
+
+def stream(
+    sweeps: Iterable[ReadableSweep],
+    config: DetectorConfig | None = None,
+    key: jax.Array | None = None,
+    *,
+    capacity: int | None = None,
+    workers: int = 1,
+) -> Iterator[StreamedSweep]:
+    """Finds the vehicles of recorded sweeps, and reads ahead meanwhile.
+
+    With one worker a thread reads and pads the next sweep while one is computed, into buffers that are used
+    again. With more, each sweep is read, padded and computed by one of so many processes, which scales
+    better than threads; each compiles, or takes the program from JAX's compilation cache where that is
+    on, and a script must start its work under ``if __name__ == "__main__":``.
+
+    It asks for sweeps before their turn: a sensor's, which come one by one, are for `detect`.
+
+    Args:
+      sweeps: what `jaxbox.io.open_sweeps` gives, or the like; with several workers they are pickled.
+      config: the settings of all; None for the default preset.
+      key: the JAX random key of all; None for `jax.random.key(0)`.
+      capacity: points that every sweep is padded to; None for the bucket that holds it.
+      workers: processes; with 1 it is this one.
+
+    Yields:
+      The result of each sweep, in their order, with the same bits as `detect` gives. One that cannot be
+      read, or that ends its process, comes with an error, and the others go on.
+
+    Raises:
+      ValueError: for settings that contradict each other or workers below 1.
+    """
+    if workers < 1:
+        raise ValueError(f"workers is {workers}; it must be at least 1.")
+    config = DetectorConfig() if config is None else config
+    check_settings(config)
+    if workers == 1:
+        return _stream_here(sweeps, config, key, capacity)
+    return _stream_apart(sweeps, _Settings.pack(config, key, capacity, workers), workers)
+
+
+def _ahead(
+    sweeps: Iterable[Any], submit: Callable[[Any], Future[Any]], count: int
+) -> Iterator[tuple[Any, Future[Any]]]:
+    """Each sweep and its future, in order; the next `count` are submitted before it is handed out."""
+    waiting = collections.deque()
+    for sweep in sweeps:
+        waiting.append((sweep, submit(sweep)))
+        if len(waiting) > count:
+            yield waiting.popleft()
+    yield from waiting
+
+
+class _Buffer:
+    """Padded arrays that sweeps of one capacity after the other are written to."""
+
+    def __init__(self) -> None:
+        self._rows, self._intensity = aligned_zeros((0, 4)), aligned_zeros((0,))
+
+    def fill(self, xyz: np.ndarray, intensity: np.ndarray | None, capacity: int | None) -> PointCloud:
+        """A cloud that holds until the buffer is filled again."""
+        xyz, intensity = checked_points(xyz, intensity)
+        capacity = fitting_capacity(len(xyz)) if capacity is None else capacity
+        if len(self._rows) != capacity:
+            self._rows, self._intensity = aligned_zeros((capacity, 4)), aligned_zeros((capacity,))
+        fill_rows(xyz, intensity, self._rows, self._intensity)
+        # On a CPU the cloud's arrays are the buffer: who fills it again has waited for the result.
+        rows = jax.device_put(self._rows, may_alias=True)
+        padded = jax.device_put(self._intensity, may_alias=True)
+        return PointCloud(rows, padded, jnp.int32(len(xyz)))
+
+
+def _read(sweep: ReadableSweep, buffer: _Buffer, capacity: int | None) -> PointCloud | str:
+    """The padded sweep, or why there is none."""
+    try:
+        return buffer.fill(*sweep.read_points(), capacity)
+    except Exception as error:
+        # Whatever a reader may raise concerns its own sweep alone.
+        return f"{type(error).__name__}: {error}"
+
+
+def _start(
+    name: str, cloud: PointCloud | str, config: DetectorConfig, key: jax.Array | None
+) -> StreamedSweep:
+    """A result whose arrays may still be computing."""
+    if isinstance(cloud, str):
+        return StreamedSweep(name, 0, None, cloud)
+    return StreamedSweep(name, int(cloud.num_points), detect(cloud, config, key), None)
+
+
+def _finish(started: StreamedSweep) -> StreamedSweep:
+    return dataclasses.replace(started, detections=jax.device_get(started.detections))
+
+
+def _stream_here(
+    sweeps: Iterable[ReadableSweep], config: DetectorConfig, key: jax.Array | None, capacity: int | None
+) -> Iterator[StreamedSweep]:
+    buffers = itertools.cycle([_Buffer() for _ in range(NUM_BUFFERS)])
+    computing: StreamedSweep | None = None
+    with concurrent.futures.ThreadPoolExecutor(1) as reader:
+        for sweep, reading in _ahead(sweeps, lambda s: reader.submit(_read, s, next(buffers), capacity), 1):
+            started = _start(sweep.name, reading.result(), config, key)
+            # The device is busy with this one while the caller looks at the one before.
+            if computing is not None:
+                yield _finish(computing)
+            computing = started
+    if computing is not None:
+        yield _finish(computing)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Settings:
+    """What a worker needs, in types that can be unpickled before JAX starts."""
+
+    config: DetectorConfig
+    key_data: np.ndarray | None
+    key_impl: str | None
+    capacity: int | None
+    num_threads: int
+    cache_folder: str | None
+
+    @classmethod
+    def pack(
+        cls, config: DetectorConfig, key: jax.Array | None, capacity: int | None, workers: int
+    ) -> "_Settings":
+        return cls(
+            config=jax.tree.map(float, config),
+            key_data=None if key is None else np.asarray(jax.random.key_data(key)),
+            key_impl=None if key is None else str(jax.random.key_impl(key)),
+            capacity=capacity,
+            num_threads=max(1, (os.cpu_count() or 1) // workers),
+            cache_folder=jax.config.values["jax_compilation_cache_dir"],
+        )
+
+    def unpack_key(self) -> jax.Array | None:
+        return (
+            None
+            if self.key_data is None
+            else jax.random.wrap_key_data(jnp.asarray(self.key_data), impl=self.key_impl)
+        )
+
+
+_worker: tuple[_Settings, jax.Array | None, _Buffer] | None = None
+"""In a worker process: what it works with."""
+
+
+def _set_up_worker(settings: _Settings) -> None:
+    global _worker  # noqa: PLW0603 - a process pool has no other place for what its tasks share
+    os.environ.setdefault(THREADS_VARIABLE, str(settings.num_threads))
+    jax.config.update("jax_compilation_cache_dir", settings.cache_folder)
+    _worker = (settings, settings.unpack_key(), _Buffer())
+
+
+def _detect_one(sweep: ReadableSweep) -> StreamedSweep:
+    assert _worker is not None, "the pool sets its workers up"
+    settings, key, buffer = _worker
+    return _finish(_start(sweep.name, _read(sweep, buffer, settings.capacity), settings.config, key))
+
+
+def _new_pool(workers: int, settings: _Settings) -> concurrent.futures.ProcessPoolExecutor:
+    # A fork would copy JAX's threads half-way through their work.
+    start = multiprocessing.get_context("spawn")
+    return concurrent.futures.ProcessPoolExecutor(workers, start, _set_up_worker, (settings,))
+
+
+def _stream_apart(
+    sweeps: Iterable[ReadableSweep], settings: _Settings, workers: int
+) -> Iterator[StreamedSweep]:
+    pool = _new_pool(workers, settings)
+
+    def submit(sweep: ReadableSweep) -> Future[StreamedSweep]:
+        nonlocal pool
+        try:
+            return pool.submit(_detect_one, sweep)
+        except BrokenProcessPool:
+            pool = _new_pool(workers, settings)
+            return pool.submit(_detect_one, sweep)
+
+    try:
+        for sweep, job in _ahead(sweeps, submit, 2 * workers):
+            try:
+                yield job.result()
+            except BrokenProcessPool:
+                # Some sweep that was in work has ended its process, and all the others with it.
+                yield _detect_alone(sweep, settings)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _detect_alone(sweep: ReadableSweep, settings: _Settings) -> StreamedSweep:
+    """Detects in a process for this sweep only, which tells whether it was the one that ended its process."""
+    with _new_pool(1, settings) as pool:
+        try:
+            return pool.submit(_detect_one, sweep).result()
+        except BrokenProcessPool as error:
+            return StreamedSweep(
+                sweep.name, 0, None, f"its process ended, perhaps for want of memory: {error}"
+            )

@@ -1,0 +1,128 @@
+"""Many sweeps at once: in turns over devices, and as a stream; the same bits as one by one."""
+
+import dataclasses
+import os
+
+import jax
+import numpy as np
+import pytest
+from test_detector import CAPACITY, assert_same_bits, found, run, street
+
+import jaxbox
+from jaxbox import DetectorConfig, PointCloud, batching, detect_batch, detector, streaming
+from jaxbox.config import EvidenceConfig
+
+SEEDS = (0, 1, 2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Recorded:
+    """A sweep as `stream` takes it; at module level, so that it can be sent to a process."""
+
+    name: str
+    xyz: np.ndarray
+    failure: str = ""
+
+    def read_points(self):
+        if self.failure == "unreadable":
+            raise OSError("the disk is gone")
+        if self.failure == "deadly":
+            os._exit(1)
+        return self.xyz, None
+
+
+def recorded(failures=None):
+    """Three streets, and what does not go well with them."""
+    sweeps = [Recorded(f"street {seed}", street(seed).xyz) for seed in SEEDS]
+    for place, failure in (failures or {}).items():
+        sweeps.insert(place, Recorded(failure, np.zeros((0, 3)), failure))
+    return sweeps
+
+
+def cloud(seed):
+    return PointCloud.from_numpy(street(seed).xyz, capacity=CAPACITY)
+
+
+def test_a_batch_has_the_bits_of_the_singles_in_their_order_and_compiles_nothing_more():
+    found(0)
+    compiled = detector.count_compilations()
+    batch = detect_batch([cloud(seed) for seed in SEEDS], devices=jax.local_devices()[:1])
+    assert detector.count_compilations() == compiled
+    for seed, detections in zip(SEEDS, batch, strict=True):
+        assert_same_bits(jax.device_get(detections), found(seed))
+
+
+def test_a_batch_takes_a_key_and_settings_for_all():
+    key, config = jax.random.key(5), jax.tree.map(lambda value: 1.1 * value, DetectorConfig())
+    (detections,) = detect_batch([cloud(0)], config, key, jax.local_devices()[:1])
+    assert_same_bits(jax.device_get(detections), run(street(0).xyz, config=config, key=key))
+
+
+def test_devices_take_turns_and_each_gets_the_cloud_and_the_key(monkeypatch):
+    # What is computed has tests enough, and each device would compile it once more.
+    monkeypatch.setattr(batching, "detect", lambda cloud, config, key: (cloud, config, key))
+    clouds, config = [cloud(seed) for seed in SEEDS], DetectorConfig()
+    calls = detect_batch(clouds, config, jax.random.key(5))
+    for number, (sent, settings, key) in enumerate(calls):
+        assert sent.xyz1.devices() == key.devices() == {jax.local_devices()[number % 2]}
+        assert settings is config
+        np.testing.assert_array_equal(sent.xyz1, clouds[number].xyz1)
+
+
+def test_a_batch_of_nothing_is_nothing_and_one_without_devices_is_refused():
+    assert detect_batch([]) == []
+    with pytest.raises(ValueError, match="devices is empty"):
+        detect_batch([cloud(0)], devices=[])
+
+
+def test_a_stream_has_the_bits_of_the_singles_and_compiles_nothing_more():
+    found(0)
+    compiled = detector.count_compilations()
+    streamed = list(jaxbox.stream(recorded() * 2, capacity=CAPACITY))
+    assert [result.name for result in streamed] == [f"street {seed}" for seed in SEEDS] * 2
+    for seed, result in zip(SEEDS * 2, streamed, strict=True):
+        assert result.num_points == len(street(seed).xyz)
+        assert_same_bits(result.detections, found(seed))
+    assert detector.count_compilations() == compiled
+
+
+def test_a_stream_reports_a_sweep_that_cannot_be_read_and_goes_on():
+    wrong = Recorded("wrong", np.zeros((5, 2), np.float32))
+    results = list(jaxbox.stream([*recorded({1: "unreadable"}), wrong], capacity=CAPACITY))
+    assert [result.name for result in results] == ["street 0", "unreadable", "street 1", "street 2", "wrong"]
+    assert [result.detections is None for result in results] == [False, True, False, False, True]
+    assert results[1].error == "OSError: the disk is gone"
+    assert "shape (5, 2)" in results[4].error
+    assert_same_bits(results[2].detections, found(1))
+
+
+def test_a_stream_reads_ahead_no_farther_than_its_buffers_and_can_be_left():
+    asked = []
+
+    def source():
+        for sweep in recorded() * 3:
+            asked.append(sweep.name)
+            yield sweep
+
+    results = jaxbox.stream(source(), capacity=CAPACITY)
+    next(results)
+    assert len(asked) <= streaming.NUM_BUFFERS
+    results.close()
+    assert list(jaxbox.stream([])) == []
+
+
+def test_a_stream_refuses_what_cannot_work_before_it_starts():
+    with pytest.raises(ValueError, match="workers is 0"):
+        jaxbox.stream([], workers=0)
+    with pytest.raises(ValueError, match=r"evidence\.enabled"):
+        jaxbox.stream([], DetectorConfig(evidence=EvidenceConfig(enabled=False)))
+
+
+def test_processes_keep_the_order_and_the_bits_and_survive_a_deadly_sweep():
+    failures = {1: "deadly", 3: "unreadable"}
+    results = list(jaxbox.stream(recorded(failures), key=jax.random.key(0), capacity=CAPACITY, workers=2))
+    assert [r.name for r in results] == ["street 0", "deadly", "street 1", "unreadable", "street 2"]
+    assert "its process ended" in results[1].error
+    assert results[3].error == "OSError: the disk is gone"
+    for seed, result in zip(SEEDS, results[::2], strict=True):
+        assert_same_bits(result.detections, found(seed))
