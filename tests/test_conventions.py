@@ -41,6 +41,7 @@ ALLOWED = {
     "reference": {"version", "types", "class_priors", "config", "masked"},
     "synthetic": FOUNDATION | {"projection"},
     **dict.fromkeys(TOOLS, FOUNDATION | STAGES | WIRING | TOOLS),
+    "export": FOUNDATION | WIRING | {"io"},
     "tuning": FOUNDATION | WIRING | TOOLS,
 }
 TOP = {"cli", "__main__", "__init__"}
@@ -52,6 +53,7 @@ PUBLIC_MODULES = [
     "jaxbox",
     "jaxbox.io",
     "jaxbox.evaluation",
+    "jaxbox.export",
     "jaxbox.tuning",
     "jaxbox.viz",
     "jaxbox.synthetic",

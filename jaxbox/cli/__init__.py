@@ -1,4 +1,4 @@
-"""The command line: ``jaxbox demo``, ``detect``, ``eval``, ``tune`` and ``info``."""
+"""The command line: ``jaxbox demo``, ``detect``, ``eval``, ``tune``, ``export`` and ``info``."""
 
 from jaxbox.cli.app import app, main
 

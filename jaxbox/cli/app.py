@@ -1,4 +1,4 @@
-"""The five commands and their options; the work is done in the module of each."""
+"""The six commands and their options; the work is done in the module of each."""
 
 import pathlib
 from typing import Annotated
@@ -10,6 +10,7 @@ from jaxbox.cli.console import input_errors, stdout
 from jaxbox.cli.demo import run_demo
 from jaxbox.cli.detect import DetectOptions, ResultFormat, run_detect
 from jaxbox.cli.evaluate import run_eval
+from jaxbox.cli.export import Platform, run_export
 from jaxbox.cli.info import print_info
 from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.cli.settings import chosen_config
@@ -214,6 +215,29 @@ def tune(
             seed=seed,
         )
         raise typer.Exit(run_tune(labels, options, stdout()))
+
+
+@app.command(epilog=EXIT_CODES)
+def export(
+    *,
+    output: Annotated[pathlib.Path, typer.Option(help="Folder for the files.")],
+    capacity: Annotated[int, typer.Option(min=1, help="Points that a sweep is padded to.")] = 2**17,
+    preset: PresetOption = "default",
+    settings: SettingsOption = None,
+    changes: SetOption = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the random key inside.")] = 0,
+    platforms: Annotated[
+        list[Platform] | None,
+        typer.Option("--platform", help="Repeatable. By default what JAX runs on here."),
+    ] = None,
+) -> None:
+    """Write the detector as StableHLO, to run without jaxbox's source: in JAX, or in C++.
+
+    One capacity, with its settings and random key inside. docs/export.md tells how to run it.
+    """
+    with input_errors():
+        config = chosen_config(preset, settings, changes or [])
+        run_export(output, config, capacity=capacity, seed=seed, platforms=platforms or [], console=stdout())
 
 
 @app.command(epilog=EXIT_CODES)
