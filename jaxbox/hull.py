@@ -1,5 +1,7 @@
 """Convex hulls of many clusters at a fixed shape (paper, section 3.3)."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -64,67 +66,73 @@ def _argmax_per_cell(cell: jax.Array, value: jax.Array, num_cells: int) -> jax.A
     return (best & (2**index_bits - 1)).astype(jnp.int32) - 1
 
 
-def convex_hull(xy: jax.Array, valid: jax.Array, *, max_vertices: int) -> tuple[jax.Array, jax.Array]:
-    """Convex hull of one cluster, counter-clockwise from its leftmost point.
+def convex_hulls(xy: jax.Array, valid: jax.Array, *, max_vertices: int) -> tuple[jax.Array, jax.Array]:
+    """Convex hulls of clusters, counter-clockwise from their leftmost points (gift wrapping).
 
-    A point is on the lower hull if every slope to a point on its left is below every slope to a point on
-    its right, and likewise, turned round, on the upper one: no order and no loop is needed.
+    From a vertex of the lower hull, the next is the point on its right at the least slope. The upper hull
+    is the lower one of the points turned by half a turn, so that all chains grow side by side.
 
     Args:
-      xy: (M, 2) float32, m.
-      valid: (M,) bool.
+      xy: (C, M, 2) float32, m.
+      valid: (C, M) bool.
       max_vertices: static, H.
 
     Returns:
-      vertices: (H, 2) float32, m, padded by repeating the last; where there are more than H, every so
+      vertices: (C, H, 2) float32, m, padded by repeating the last; where there are more than H, every so
         many are kept, evenly round the hull; zeros where no point is valid.
-      num_vertices: () int32, the true number, which may exceed H.
+      num_vertices: (C,) int32, the true number, which may exceed H.
 
     Reference: paper, section 3.3 and equation 6; oracle cv2.convexHull.
     """
-    lower, upper = _on_hull(xy, valid)
-    x, y = xy[:, 0], xy[:, 1]
-    # Along the lower hull x rises, along the upper one it falls.
-    part = jnp.where(lower, 0, jnp.where(upper, 1, 2))
-    _, _, x, y = jax.lax.sort((part, jnp.where(lower, x, -x), x, y), num_keys=2, is_stable=False)
-    count = jnp.sum(lower | upper)
-    j = jnp.arange(max_vertices)
-    pick = jnp.where(count > max_vertices, j * count // max_vertices, jnp.minimum(j, count - 1))
-    pick = jnp.clip(pick, 0, xy.shape[0] - 1)
-    return jnp.where(count > 0, jnp.stack([x[pick], y[pick]], axis=1), 0), count
+    size = valid.shape[0]
+    # Points along the leading axis: reductions along it vectorise (XLA, CPU).
+    x, y = (jnp.concatenate([v.T, -v.T], axis=1) for v in (xy[..., 0], xy[..., 1]))
+    chain_x, chain_y, count = _lower_hulls(x, y, jnp.concatenate([valid.T, valid.T], axis=1))
+    # A chain that ends where the other begins leaves that point to it.
+    end = jnp.maximum(count - 1, 0), jnp.arange(2 * size)
+    closes_x, closes_y = (chain[end] == -jnp.roll(chain[0], size) for chain in (chain_x, chain_y))
+    count = count - (closes_x & closes_y & (count > 0))
+    # Points all in one place close both chains.
+    num_lower = jnp.maximum(count[:size], jnp.any(valid, axis=1))
+    num_vertices = num_lower + count[size:]
+    j, num = jnp.arange(max_vertices), num_vertices[:, None]
+    pick = jnp.where(num > max_vertices, j * num // max_vertices, jnp.maximum(jnp.minimum(j, num - 1), 0))
+    is_lower = pick < num_lower[:, None]
+    row = jnp.where(is_lower, pick, pick - num_lower[:, None])
+    column = jnp.arange(size)[:, None] + jnp.where(is_lower, 0, size)
+    vertices = jnp.stack([chain_x[row, column], chain_y[row, column]], axis=2)
+    return jnp.where(is_lower[..., None], vertices, -vertices), num_vertices
 
 
-def _on_hull(xy: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Which points are vertices of the lower hull and which, beside those, of the upper, (M,) bool each."""
-    x, y = xy[:, 0], xy[:, 1]
-    index = jnp.arange(xy.shape[0])
+def _lower_hulls(x: jax.Array, y: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Lower hulls of point sets (M, C), from left to right, and how many vertices each has, (C,).
 
-    def see(i: jax.Array, slopes: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
-        # The point i as seen from all others: a loop over points vectorises, a table of pairs does not.
-        lowest_right, lowest_left, highest_left, highest_right = slopes
-        dx, dy = x[i] - x, y[i] - y
-        slope = dy / jnp.where(dx == 0, 1, dx)
-        left, right, same = valid[i] & (dx < 0), valid[i] & (dx > 0), valid[i] & (dx == 0)
-        # Of points above one another only the lowest and the highest count, and of equal ones the first.
-        twin = (dy == 0) & (i < index)
-        return (
-            jnp.minimum(lowest_right, _least(right, slope, same & ((dy < 0) | twin))),
-            jnp.minimum(lowest_left, _least(left, slope, same & ((dy > 0) | twin))),
-            jnp.maximum(highest_left, jnp.where(left, slope, -jnp.inf)),
-            jnp.maximum(highest_right, jnp.where(right, slope, -jnp.inf)),
-        )
+    Of points above one another only the lowest counts. Rows beyond the last vertex are zero or repeat it.
+    """
+    far = jnp.inf
 
-    far = jnp.full_like(x, jnp.inf)
-    slopes = jax.lax.fori_loop(0, xy.shape[0], see, (far, far, -far, -far))
-    lowest_right, lowest_left, highest_left, highest_right = slopes
-    lower = valid & (highest_left < lowest_right)
-    upper = valid & (highest_right < lowest_left)
-    return lower, upper & ~lower
+    def step(state: Any) -> Any:
+        i, at_x, at_y, grows, chain_x, chain_y, count = state
+        chain_x = jax.lax.dynamic_update_index_in_dim(chain_x, at_x, i, 0)
+        chain_y = jax.lax.dynamic_update_index_in_dim(chain_y, at_y, i, 0)
+        dx, dy = x - at_x, y - at_y
+        right = valid & (dx > 0)
+        slope = jnp.where(right, dy / jnp.where(right, dx, 1), far)
+        # Of points on a line the farthest.
+        best = right & (slope == jnp.min(slope, axis=0))
+        next_x = jnp.max(jnp.where(best, x, -far), axis=0)
+        next_y = jnp.min(jnp.where(best & (x == next_x), y, far), axis=0)
+        count, grows = count + grows, next_x > -far
+        at_x, at_y = jnp.where(grows, next_x, at_x), jnp.where(grows, next_y, at_y)
+        return i + 1, at_x, at_y, grows, chain_x, chain_y, count
 
-
-def _least(side: jax.Array, slope: jax.Array, barred: jax.Array) -> jax.Array:
-    """(M,) slopes to a point on a side, infinite if it is not; minus infinity where it bars the other."""
-    return jnp.where(barred, -jnp.inf, jnp.where(side, slope, jnp.inf))
+    left = jnp.min(jnp.where(valid, x, far), axis=0)
+    lowest = jnp.min(jnp.where(valid & (x == left), y, far), axis=0)
+    present = jnp.any(valid, axis=0)
+    start = jnp.where(present, left, 0), jnp.where(present, lowest, 0)
+    state = (0, *start, present, jnp.zeros_like(x), jnp.zeros_like(y), jnp.zeros(x.shape[1], jnp.int32))
+    *_, chain_x, chain_y, count = jax.lax.while_loop(lambda state: jnp.any(state[3]), step, state)
+    return chain_x, chain_y, count
 
 
 def polygon_area(vertices: jax.Array) -> jax.Array:

@@ -1,6 +1,7 @@
 """Vehicle decision: what surrounds a box, its score, and suppression of overlapping boxes."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 
@@ -8,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.geometry import rectangle_iou
-from jaxbox.masked import map_rows, prefix_sum, sort_by_group
+from jaxbox.masked import WORD_BITS, map_rows, prefix_sum, sort_by_group
 
 NEARBY_CELL_M = 1.0
 """Points are looked up by cells of this size."""
@@ -35,8 +36,8 @@ points the share says little."""
 BOX_CHUNK = 128
 """Boxes looked at together."""
 
-OVERLAP_CHUNK = 32
-"""Rows of the overlap matrix at a time."""
+OVERLAP_TILE = WORD_BITS
+"""Rows and columns of the overlap matrix at a time: a word of bits each row."""
 
 
 @jax.tree_util.register_dataclass
@@ -353,15 +354,38 @@ def suppress(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | flo
 
     Reference: oracle `jaxbox.reference.suppress`.
     """
-    num_boxes = jnp.sum(valid)
+    rivals = _overlaps(boxes, jnp.sum(valid), max_overlap)[: valid.shape[0]]
 
-    def overlaps(rows: jax.Array) -> jax.Array:
-        return jax.vmap(jax.vmap(rectangle_iou, (None, 0)), (0, None))(rows, boxes) > max_overlap
+    def step(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        _, keep = state
+        return keep, valid & ~jnp.any((rivals & _pack(keep)) != 0, axis=1)
 
-    overlap = map_rows(overlaps, boxes, num_rows=num_boxes, chunk=OVERLAP_CHUNK)
+    # A box depends on better ones only: after k rounds the first k are right, and where nothing changes all
+    # are. A few rounds do: chains of boxes that overlap one after the other are short.
+    return jax.lax.while_loop(lambda s: jnp.any(s[0] != s[1]), step, (jnp.zeros_like(valid), valid))[1]
 
-    def step(i: jax.Array, keep: jax.Array) -> jax.Array:
-        # Rows after i are not kept yet, so only better boxes can stand in the way.
-        return keep.at[i].set(~jnp.any(overlap[i] & keep))
 
-    return jax.lax.fori_loop(0, num_boxes, step, jnp.zeros_like(valid)) & valid
+def _overlaps(boxes: jax.Array, num_boxes: jax.Array, max_overlap: jax.Array | float) -> jax.Array:
+    """(P, P / 32) uint32: which better boxes each one overlaps, as bits."""
+    boxes = jnp.pad(boxes, ((0, -boxes.shape[0] % OVERLAP_TILE), (0, 0)))
+    row = jnp.arange(OVERLAP_TILE)
+
+    def tile(i: jax.Array, j: jax.Array, bits: jax.Array) -> jax.Array:
+        first, second = (jax.lax.dynamic_slice_in_dim(boxes, k * OVERLAP_TILE, OVERLAP_TILE) for k in (i, j))
+        iou = jax.vmap(jax.vmap(rectangle_iou, (None, 0)), (0, None))(first, second)
+        better = j * OVERLAP_TILE + row < i * OVERLAP_TILE + row[:, None]
+        return jax.lax.dynamic_update_slice(bits, _pack((iou > max_overlap) & better), (i * OVERLAP_TILE, j))
+
+    def tiles(i: jax.Array, bits: jax.Array) -> jax.Array:
+        return jax.lax.fori_loop(0, i + 1, functools.partial(tile, i), bits)
+
+    bits = jnp.zeros((boxes.shape[0], boxes.shape[0] // OVERLAP_TILE), jnp.uint32)
+    return jax.lax.fori_loop(0, (num_boxes + OVERLAP_TILE - 1) // OVERLAP_TILE, tiles, bits)
+
+
+def _pack(flags: jax.Array) -> jax.Array:
+    """Truth values along the last axis as the bits of words."""
+    flags = jnp.pad(flags, [(0, 0)] * (flags.ndim - 1) + [(0, -flags.shape[-1] % WORD_BITS)])
+    bits = flags.reshape(*flags.shape[:-1], -1, WORD_BITS)
+    values = jnp.uint32(1) << jnp.arange(WORD_BITS, dtype=jnp.uint32)
+    return jnp.sum(jnp.where(bits, values, jnp.uint32(0)), axis=-1, dtype=jnp.uint32)

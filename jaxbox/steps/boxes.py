@@ -82,8 +82,7 @@ def _hull_points(
 
 def trace_hulls(xy: jax.Array, index: jax.Array, *, max_vertices: int) -> tuple[jax.Array, jax.Array]:
     """Hulls of the clusters whose points are listed: (C, H, 2) m, and their true numbers of vertices."""
-    one = functools.partial(hull.convex_hull, max_vertices=max_vertices)
-    return jax.vmap(one)(take(xy, index), index < xy.shape[0])
+    return hull.convex_hulls(take(xy, index), index < xy.shape[0], max_vertices=max_vertices)
 
 
 def _slab_points(
