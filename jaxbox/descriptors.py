@@ -3,19 +3,46 @@
 import jax
 import jax.numpy as jnp
 
+from jaxbox.masked import fold_rows, take
 from jaxbox.types import Descriptors
+
+POINT_CHUNK = 4096
+"""Points looked at together."""
 
 MIN_VARIANCE = 1e-6
 """m^2: points on a line have a minor axis of a millimetre rather than none."""
 
 
-def shape_descriptors(
-    slot: jax.Array,
-    xy: jax.Array,
-    origin: jax.Array,
-    hull_area: jax.Array,
-    num_vertices: jax.Array,
-) -> Descriptors:
+def point_moments(
+    slot: jax.Array, row: jax.Array, num_rows: jax.Array, xy: jax.Array, origin: jax.Array
+) -> jax.Array:
+    """Sums over the points of each cluster, from which their shape follows.
+
+    Args:
+      slot: (L,) int32 cluster of each point of a list, K for none.
+      row: (L,) int32 rows of those points.
+      num_rows: () int32; only the first so many of the list count.
+      xy: (N, 2) float32, m.
+      origin: (K, 2) float32, m, a point near each cluster: moments about it do not cancel.
+
+    Returns:
+      (K, 6) float32: the sums of 1, x, y, x^2, y^2 and x y, about the origin.
+    """
+    size = origin.shape[0]
+
+    def add(total: list[jax.Array], _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> list[jax.Array]:
+        slot, row = rows
+        d = take(xy, row) - take(origin, slot)
+        # A scatter each: one of rows would first have to be built, which costs more (XLA, CPU).
+        values = (jnp.ones_like(d[:, 0]), d, d * d, d[:, 0] * d[:, 1])
+        return [t.at[slot].add(v, mode="drop") for t, v in zip(total, values, strict=True)]
+
+    total = [jnp.zeros(size), jnp.zeros((size, 2)), jnp.zeros((size, 2)), jnp.zeros(size)]
+    total = fold_rows(add, total, (slot, row), num_rows=num_rows, chunk=POINT_CHUNK)
+    return jnp.concatenate([t.reshape(size, -1) for t in total], axis=1)
+
+
+def shape_descriptors(moments: jax.Array, hull_area: jax.Array, num_vertices: jax.Array) -> Descriptors:
     """Describes the shape of each cluster, seen from above.
 
     With l1 >= l2 the eigenvalues of the covariance of the points, which are their moments of inertia per
@@ -23,9 +50,7 @@ def shape_descriptors(
     density = points / hull area; complexity kappa = hull vertices / points (equation 7).
 
     Args:
-      slot: (N,) int32 cluster of each point, K for none.
-      xy: (N, 2) float32, m.
-      origin: (K, 2) float32, m, a point near each cluster: moments about it do not cancel.
+      moments: (K, 6) float32, see `point_moments`.
       hull_area: (K,) float32, m^2.
       num_vertices: (K,) int32.
 
@@ -34,17 +59,9 @@ def shape_descriptors(
 
     Reference: paper, sections 3.5 and 4.4; oracle `jaxbox.reference.shape_descriptors`.
     """
-    size = origin.shape[0]
-    d = xy - origin[jnp.minimum(slot, size - 1)]
-    dx, dy = d[:, 0], d[:, 1]
-
-    def total(values: jax.Array) -> jax.Array:
-        # A scatter each: one of rows would first have to be built, which costs more (XLA, CPU).
-        return jnp.zeros(size).at[slot].add(values, mode="drop")
-
-    count = total(jnp.ones_like(dx))
-    x, y, xx, yy, xy_ = (total(v) / jnp.maximum(count, 1) for v in (dx, dy, dx * dx, dy * dy, dx * dy))
-    major, minor = _eigenvalues(xx - x * x, yy - y * y, xy_ - x * y)
+    count = moments[:, 0]
+    x, y, xx, yy, xy = (moments[:, 1:] / jnp.maximum(count, 1)[:, None]).T
+    major, minor = _eigenvalues(xx - x * x, yy - y * y, xy - x * y)
     present = count > 0
     ratio = jnp.maximum(major, MIN_VARIANCE) / jnp.maximum(minor, MIN_VARIANCE)
     has_area = present & (hull_area > 0)

@@ -1,17 +1,29 @@
 """Convex hulls of many clusters at a fixed shape (paper, section 3.3)."""
 
+import functools
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import take
+from jaxbox.masked import WORD_BITS, fold_rows, take
+
+POINT_CHUNK = 4096
+"""Points looked at together."""
 
 MIN_EXTENT_M = 1e-6
 """Clusters narrower than this are cut as if they were so wide: all their points are in one slice."""
 
 
-def extreme_points(slot: jax.Array, xy: jax.Array, *, num_clusters: int, num_slices: int) -> jax.Array:
+def extreme_points(
+    slot: jax.Array,
+    row: jax.Array,
+    num_rows: jax.Array,
+    xy: jax.Array,
+    *,
+    num_clusters: int,
+    num_slices: int,
+) -> jax.Array:
     """The points of each cluster that can reach its hull: the extremes of thin slices.
 
     The cluster's bounding box is cut into slices along x, and along y; each slice keeps its two extreme
@@ -20,50 +32,56 @@ def extreme_points(slot: jax.Array, xy: jax.Array, *, num_clusters: int, num_sli
     extent / 2^11 for sweeps of up to a million points.
 
     Args:
-      slot: (N,) int32 cluster of each point, `num_clusters` for none.
+      slot: (L,) int32 cluster of each point of a list, `num_clusters` for none.
+      row: (L,) int32 rows of those points.
+      num_rows: () int32; only the first so many of the list count.
       xy: (N, 2) float32, m.
       num_clusters: static, K.
       num_slices: static, S.
 
     Returns:
-      (K, 4 S) int32: indices of the points, some of them twice; N where a slice is empty.
+      (K, 4 S) int32: rows of points, some of them twice; N where a slice is empty.
 
     Reference: tested against cv2.convexHull of all points.
     """
-    size = xy.shape[0]
-    place = [_place_in_bounds(slot, xy[:, axis], num_clusters) for axis in (0, 1)]
-    best = []
-    for along, across in (place, place[::-1]):
-        piece = jnp.clip((along * num_slices).astype(jnp.int32), 0, num_slices - 1)
-        cell = slot * num_slices + piece
-        for value in (across, 1 - across):
-            best.append(_argmax_per_cell(cell, value, num_clusters * num_slices))
-    index = jnp.concatenate([b.reshape(num_clusters, num_slices) for b in best], axis=1)
-    return jnp.where(index < 0, size, index)
-
-
-def _place_in_bounds(slot: jax.Array, values: jax.Array, num_clusters: int) -> jax.Array:
-    """(N,) in [0, 1]: where each value lies between the least and the greatest of its cluster."""
-    low = jnp.full(num_clusters, jnp.inf).at[slot].min(values, mode="drop")
-    high = jnp.full(num_clusters, -jnp.inf).at[slot].max(values, mode="drop")
-    scale = 1 / jnp.maximum(high - low, MIN_EXTENT_M)
-    return jnp.clip((values - take(low, slot)) * take(scale, slot), 0, 1)
-
-
-def _argmax_per_cell(cell: jax.Array, value: jax.Array, num_cells: int) -> jax.Array:
-    """(cells,) int32: the point with the largest value, in [0, 1], of each cell; -1 where it is empty.
-
-    One scatter finds the largest value and where it is: the value's leading bits stand above the
-    point's index in one word.
-    """
-    size = cell.shape[0]
-    index_bits = size.bit_length()
+    index_bits = row.shape[0].bit_length()
     # More bits than float32 holds would round the largest value up, out of the word.
-    value_bits = min(32 - index_bits, 24)
-    quantised = (value * (2**value_bits - 1)).astype(jnp.uint32)
-    key = (quantised << index_bits) | (jnp.arange(size, dtype=jnp.uint32) + 1)
-    best = jnp.zeros(num_cells, jnp.uint32).at[cell].max(key, mode="drop")
-    return (best & (2**index_bits - 1)).astype(jnp.int32) - 1
+    value_bits = min(WORD_BITS - index_bits, 24)
+    fold = functools.partial(fold_rows, rows=(slot, row), num_rows=num_rows, chunk=POINT_CHUNK)
+    # Low bounds are high ones of the points turned by half a turn.
+    sign = jnp.array([[1.0], [-1.0]])
+
+    def widen(bounds: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
+        slot, row = rows
+        both = take(xy, row)[:, None] * sign
+        return bounds.at[slot].max(both.reshape(-1, 4), mode="drop")
+
+    bounds = fold(widen, jnp.full((num_clusters, 4), -jnp.inf))
+    low, extent = -bounds[:, 2:], bounds[:, :2] + bounds[:, 2:]
+    frame = jnp.concatenate([low, 1 / jnp.maximum(extent, MIN_EXTENT_M)], axis=1)
+
+    def keep_extremes(
+        best: list[jax.Array], index: jax.Array, rows: tuple[jax.Array, jax.Array]
+    ) -> list[jax.Array]:
+        slot, row = rows
+        # Where each point lies between the least and the greatest of its cluster, in [0, 1].
+        place = (take(xy, row) - take(frame[:, :2], slot)) * take(frame[:, 2:], slot)
+        x, y = jnp.clip(place[:, 0], 0, 1), jnp.clip(place[:, 1], 0, 1)
+        directions = ((x, y), (x, 1 - y), (y, x), (y, 1 - x))
+        new = []
+        for before, (along, across) in zip(best, directions, strict=True):
+            piece = jnp.minimum((along * num_slices).astype(jnp.int32), num_slices - 1)
+            # One scatter finds the largest value and where it is: the value's leading bits stand above
+            # the point's index in one word. (Conversions to int32 vectorise, those to uint32 do not.)
+            quantised = (across * (2**value_bits - 1)).astype(jnp.int32).astype(jnp.uint32)
+            key = (quantised << index_bits) | (index.astype(jnp.uint32) + 1)
+            new.append(before.at[slot * num_slices + piece].max(key, mode="drop"))
+        return new
+
+    best = fold(keep_extremes, [jnp.zeros(num_clusters * num_slices, jnp.uint32)] * 4)
+    best = jnp.concatenate([b.reshape(num_clusters, num_slices) for b in best], axis=1)
+    index = (best & (2**index_bits - 1)).astype(jnp.int32)
+    return jnp.where(index > 0, take(row, jnp.maximum(index - 1, 0)), xy.shape[0])
 
 
 def convex_hulls(xy: jax.Array, valid: jax.Array, *, max_vertices: int) -> tuple[jax.Array, jax.Array]:
@@ -147,7 +165,7 @@ def polygon_area(vertices: jax.Array) -> jax.Array:
     >>> float(polygon_area(jnp.array([[0.0, 0], [2, 0], [2, 1], [0, 1]])))
     2.0
     """
-    # About the first vertex, so that far polygons keep their digits.
-    p = vertices - vertices[..., :1, :]
-    q = jnp.roll(p, -1, axis=-2)
+    # About the first vertex: far polygons keep their digits, and the edge that closes them adds nothing.
+    local = vertices - vertices[..., :1, :]
+    p, q = local[..., :-1, :], local[..., 1:, :]
     return 0.5 * jnp.sum(p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0], axis=-1)

@@ -150,6 +150,31 @@ def apart(function: Callable[..., Any], *operands: Any, proof: jax.Array) -> Any
     )
 
 
+def count_true(*masks: jax.Array) -> list[jax.Array]:
+    """How many entries of each mask are True.
+
+    One pass for every three masks: a sum of words counts them all, each in bits of its own.
+
+    Args:
+      *masks: (N,) bool each.
+
+    Returns:
+      () int32 each.
+
+    >>> [int(n) for n in count_true(jnp.array([True, False]), jnp.array([True, True]))]
+    [1, 2]
+    """
+    bits = BLOCK.bit_length()
+    per_word = WORD_BITS // bits
+    totals = []
+    for first in range(0, len(masks), per_word):
+        group = masks[first : first + per_word]
+        word = functools.reduce(jnp.add, [jnp.where(mask, 1 << k * bits, 0) for k, mask in enumerate(group)])
+        words = jnp.sum(jnp.pad(word, (0, -word.shape[0] % BLOCK)).reshape(-1, BLOCK), axis=1)
+        totals += [jnp.sum((words >> k * bits) & (2**bits - 1)) for k in range(len(group))]
+    return totals
+
+
 def masked_mean(values: jax.Array, mask: jax.Array) -> jax.Array:
     """Mean of the masked values along the last axis; 0 where there are none.
 
@@ -212,6 +237,32 @@ def map_rows(function: Callable[[Any], Any], rows: Any, *, num_rows: jax.Array, 
     num_chunks = (jnp.minimum(num_rows, capacity) + chunk - 1) // chunk
     out = jax.lax.fori_loop(0, num_chunks, step, out)
     return jax.tree.map(lambda a: a[:capacity], out)
+
+
+def fold_rows(
+    update: Callable[[Any, jax.Array, Any], Any], state: Any, rows: Any, *, num_rows: jax.Array, chunk: int
+) -> Any:
+    """Folds rows into a state, chunk by chunk, and skips chunks beyond the rows that count.
+
+    Args:
+      update: maps the state, the indices of the rows of a chunk, and those rows, a pytree of (chunk, ...)
+        arrays, to the next state. Rows of the last chunk may lie beyond `num_rows`, or be zero.
+      state: pytree of arrays.
+      rows: pytree of (P, ...) arrays.
+      num_rows: () int32, how many rows count.
+      chunk: static, rows at a time.
+
+    Returns:
+      The state after the last chunk.
+    """
+    size = jax.tree.leaves(rows)[0].shape[0]
+    padded = jax.tree.map(lambda a: jnp.pad(a, [(0, -size % chunk)] + [(0, 0)] * (a.ndim - 1)), rows)
+
+    def step(i: jax.Array, state: Any) -> Any:
+        part = jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, i * chunk, chunk), padded)
+        return update(state, i * chunk + jnp.arange(chunk), part)
+
+    return jax.lax.fori_loop(0, (jnp.minimum(num_rows, size) + chunk - 1) // chunk, step, state)
 
 
 def map_by_size(

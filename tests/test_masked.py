@@ -76,6 +76,25 @@ def test_masked_mean_and_deviation_equal_numpy_over_the_masked_values(offset):
         np.testing.assert_allclose(std[row], kept.std(), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.parametrize("size", SIZES)
+def test_count_true_counts_every_mask_also_where_all_are_true(size):
+    rng = np.random.default_rng(size)
+    masks = [rng.random(size) < density for density in (0.0, 0.2, 1.0, 1.0, 0.7)]
+    assert [int(n) for n in masked.count_true(*map(jnp.asarray, masks))] == [mask.sum() for mask in masks]
+
+
+@pytest.mark.parametrize("num_rows", [0, 1, 8, 19, 20])
+def test_fold_rows_sees_each_row_once_and_no_chunk_beyond_those_that_count(num_rows):
+    def add(state, index, rows):
+        total, seen = state
+        return total + jnp.sum(jnp.where(index < num_rows, rows, 0)), seen + len(rows)
+
+    start = jnp.int32(0), jnp.int32(0)
+    total, seen = masked.fold_rows(add, start, jnp.arange(20) + 1, num_rows=jnp.int32(num_rows), chunk=8)
+    assert int(total) == num_rows * (num_rows + 1) // 2
+    assert int(seen) == -(-num_rows // 8) * 8
+
+
 @pytest.mark.parametrize("chunk", [1, 4, 16])
 def test_map_rows_equals_the_function_on_all_rows_and_zero_beyond_the_last_chunk(chunk):
     rows = {"a": jnp.arange(1.0, 11), "b": jnp.ones((10, 2), jnp.int32)}

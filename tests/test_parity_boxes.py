@@ -35,6 +35,7 @@ def convex_hulls(points, valid, num_clusters):
 polygon_area = jax.jit(hull.polygon_area)
 try_rotations = jax.jit(box.try_rotations, static_argnames=("criterion", "num_angles"))
 scene_preference = jax.jit(box.scene_preference, static_argnames="num_angles")
+point_moments = jax.jit(descriptors.point_moments)
 shape_descriptors = jax.jit(descriptors.shape_descriptors)
 
 
@@ -119,6 +120,8 @@ def test_extreme_points_lose_at_most_a_slice_of_the_hull(cases):
         slot = np.where(case.slot < 0, parity.MAX_CLUSTERS, case.slot)
         rows = (
             parity.pad(slot, parity.MAX_OBSTACLES, parity.MAX_CLUSTERS),
+            jnp.arange(parity.MAX_OBSTACLES),
+            len(xy),
             parity.pad(xy, parity.MAX_OBSTACLES),
         )
         index = np.asarray(extreme_points(*rows))
@@ -220,11 +223,16 @@ def test_descriptors_are_those_of_the_reference(cases):
         members = [xy[case.slot == k].astype(float) for k in range(len(case.proposals))]
         hulls = [reference.convex_hull(m) for m in members]
         expected = [reference.shape_descriptors(m, h) for m, h in zip(members, hulls, strict=True)]
-        ours = shape_descriptors(
+        moments = point_moments(
             parity.pad(slot, parity.MAX_OBSTACLES, parity.MAX_CLUSTERS),
+            jnp.arange(parity.MAX_OBSTACLES),
+            len(xy),
             parity.pad(xy, parity.MAX_OBSTACLES),
             # Up to a metre beside the middle, as that of a completed box may be.
             parity.pad(np.array([m.mean(axis=0) + 0.7 for m in members]), parity.MAX_CLUSTERS),
+        )
+        ours = shape_descriptors(
+            moments,
             parity.pad(np.array([abs(reference.signed_area(h)) for h in hulls]), parity.MAX_CLUSTERS),
             parity.pad(np.array([len(h) for h in hulls]), parity.MAX_CLUSTERS),
         )

@@ -8,15 +8,12 @@ import jax.numpy as jnp
 
 from jaxbox import descriptors, hull, vehicles
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import compact, map_rows, take
+from jaxbox.masked import compact, count_true, fold_rows, lookup, map_rows, store, take
 from jaxbox.steps.boxes import HULL_CHUNK, Fits, max_slab_points, trace_hulls
 from jaxbox.steps.decision import Candidates
 from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals
 from jaxbox.types import Counts, Descriptors, Detections, Hulls, PointCloud, Status
-
-OWNED_SHARE = 4
-"""Detections mostly own less than this part of the obstacle points."""
 
 OWNER_CHUNK = 4096
 """Points whose detections are looked up at a time."""
@@ -41,16 +38,19 @@ def conclude(
     row, num = compact(keep, settings.max_detections)
     kept = jax.tree.map(lambda a: take(a, row), dataclasses.replace(candidates, num=keep))
     valid = row < keep.shape[0]
-    owner = _owners(kept, valid, obstacles, proposals)
-    num_points, hulls, shapes = _describe(owner, kept, num, obstacles, config)
+    asked, owner, num_asked = _owners(kept, valid, obstacles, proposals)
+    num_points, hulls, shapes = _describe(owner, asked, num_asked, obstacles.xy, kept, num, config)
     center = jnp.concatenate([kept.rectangle[:, :2], (kept.bottom + kept.height / 2)[:, None]], axis=1)
     size = jnp.concatenate([kept.rectangle[:, 2:4], kept.height[:, None]], axis=1)
     largest_hull = jnp.maximum(jnp.max(hulls.num_vertices), fits.hull_vertices)
     counts = _counts(cloud, sweep, heights, obstacles, proposals, candidates, num, largest_hull, config)
 
-    def per_point(value: jax.Array, absent: int) -> jax.Array:
-        everywhere = jnp.full(sweep.xyz.shape[0], absent, jnp.int32)
-        return everywhere.at[obstacles.row].set(value.astype(jnp.int32), mode="drop")
+    nowhere = jnp.full(sweep.xyz.shape[0], -1, jnp.int32)
+
+    def claim(point_detection: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
+        index, owner = rows
+        row = take(obstacles.row, index, obstacles.num_rows)
+        return point_detection.at[row].set(jnp.where(owner < valid.shape[0], owner, -1), mode="drop")
 
     return Detections(
         center=jnp.where(valid[:, None], center, 0),
@@ -64,63 +64,72 @@ def conclude(
         descriptors=shapes,
         ground=heights.plane,
         ground_mask=sweep.inlier & (heights.height <= config.ground.min_height_m),
-        point_component=per_point(proposals.maps[0].component, -1),
-        point_detection=per_point(jnp.where(owner < settings.max_detections, owner, -1), -1),
+        point_component=nowhere.at[obstacles.row].set(proposals.maps[0].component, mode="drop"),
+        point_detection=fold_rows(claim, nowhere, (asked, owner), num_rows=num_asked, chunk=OWNER_CHUNK),
         status=_status(counts, sweep, heights, obstacles, proposals, config),
         counts=counts,
     )
 
 
 def _describe(
-    owner: jax.Array, kept: Candidates, num: jax.Array, obstacles: Obstacles, config: DetectorConfig
+    owner: jax.Array,
+    row: jax.Array,
+    num_rows: jax.Array,
+    xy: jax.Array,
+    kept: Candidates,
+    num: jax.Array,
+    config: DetectorConfig,
 ) -> tuple[jax.Array, Hulls, Descriptors]:
     """How many points each detection has, and their hull and shape."""
-    size, capacity = config.vehicles.max_detections, owner.shape[0]
-    trace = functools.partial(trace_hulls, max_vertices=config.hull.max_vertices)
-    row, num_owned = compact(owner < size, capacity)
-
-    def describe(row: jax.Array) -> tuple[jax.Array, Hulls, Descriptors]:
-        of, xy = take(owner, row, size), take(obstacles.xy, row)
-        outline = hull.extreme_points(of, xy, num_clusters=size, num_slices=config.hull.num_slices)
-        vertices, num_vertices = map_rows(
-            functools.partial(trace, xy), outline, num_rows=num, chunk=HULL_CHUNK
-        )
-        num_points = jnp.zeros(size, jnp.int32).at[of].add(1, mode="drop")
-        area = hull.polygon_area(vertices)
-        shapes = descriptors.shape_descriptors(of, xy, kept.rectangle[:, :2], area, num_vertices)
-        return num_points, Hulls(vertices, num_vertices), shapes
-
-    # Few points belong to a detection as a rule, and the work is in proportion to their list.
-    few = capacity // OWNED_SHARE
-    return jax.lax.cond(num_owned <= few, lambda: describe(row[:few]), lambda: describe(row))
+    outline = hull.extreme_points(
+        owner,
+        row,
+        num_rows,
+        xy,
+        num_clusters=config.vehicles.max_detections,
+        num_slices=config.hull.num_slices,
+    )
+    trace = functools.partial(trace_hulls, xy, max_vertices=config.hull.max_vertices)
+    vertices, num_vertices = map_rows(trace, outline, num_rows=num, chunk=HULL_CHUNK)
+    moments = descriptors.point_moments(owner, row, num_rows, xy, kept.rectangle[:, :2])
+    shapes = descriptors.shape_descriptors(moments, hull.polygon_area(vertices), num_vertices)
+    return moments[:, 0].astype(jnp.int32), Hulls(vertices, num_vertices), shapes
 
 
-def _owners(kept: Candidates, valid: jax.Array, obstacles: Obstacles, proposals: Proposals) -> jax.Array:
-    """(O,) the detection each point belongs to, K for none: the best of its clusters' boxes that hold it."""
+def _owners(
+    kept: Candidates, valid: jax.Array, obstacles: Obstacles, proposals: Proposals
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The points of clusters that have a detection, and the detection that each belongs to.
+
+    Returns:
+      index: (O,) int32 of the obstacle, O beyond.
+      owner: (O,) int32, the best of the point's clusters' boxes that hold it, K for none.
+      num: () int32; only the first so many rows count.
+    """
     num_detections, num_clusters = valid.shape[0], proposals.num_points.shape[0]
     rank = jnp.where(valid, jnp.arange(num_detections), num_detections)
-    of_cluster = jnp.full(num_clusters, num_detections).at[kept.cluster].min(rank, mode="drop")
+    of_cluster = jnp.full(num_clusters + 1, num_detections).at[kept.cluster].min(rank, mode="drop")
     x, y, length, width, yaw = kept.rectangle.T
-    frame = jnp.stack([x, y, jnp.cos(yaw), jnp.sin(yaw), length / 2, width / 2], axis=1)
-    of_point = [take(of_cluster, cluster, num_detections) for cluster in proposals.cluster]
-    asked, num_asked = compact(
-        functools.reduce(jnp.minimum, of_point) < num_detections, obstacles.row.shape[0]
-    )
+    half_length, half_width = length / 2 + INSIDE_TOLERANCE_M, width / 2 + INSIDE_TOLERANCE_M
+    frame = jnp.stack([x, y, jnp.cos(yaw), jnp.sin(yaw), half_length, half_width], axis=1)
+    # No point is inside the box of no detection.
+    frame = jnp.pad(frame, ((0, 1), (0, 0)), constant_values=-1)
+    best = functools.reduce(jnp.minimum, [lookup(of_cluster, cluster) for cluster in proposals.cluster])
+    asked, num_asked = compact(store(best < num_detections, obstacles.count >= 0), best.shape[0])
 
-    def own(row: jax.Array) -> jax.Array:
-        xy = take(obstacles.xy, row)
-        owner = jnp.full(row.shape, num_detections)
-        for each in of_point:
-            detection = take(each, row, num_detections)
-            x, y, cos, sin, half_length, half_width = take(frame, detection).T
+    def own(index: jax.Array) -> jax.Array:
+        xy = take(obstacles.xy, index)
+        owner = jnp.full(index.shape, num_detections)
+        for cluster in proposals.cluster:
+            detection = lookup(of_cluster, take(cluster, index, num_clusters))
+            x, y, cos, sin, half_length, half_width = jnp.take(frame, detection, axis=0, mode="clip").T
             dx, dy = xy[:, 0] - x, xy[:, 1] - y
-            inside = jnp.abs(dx * cos + dy * sin) <= half_length + INSIDE_TOLERANCE_M
-            inside = inside & (jnp.abs(dy * cos - dx * sin) <= half_width + INSIDE_TOLERANCE_M)
+            inside = jnp.abs(dx * cos + dy * sin) <= half_length
+            inside = inside & (jnp.abs(dy * cos - dx * sin) <= half_width)
             owner = jnp.minimum(owner, jnp.where(inside, detection, num_detections))
         return owner
 
-    owner = map_rows(own, asked, num_rows=num_asked, chunk=OWNER_CHUNK)
-    return jnp.full(obstacles.row.shape, num_detections).at[asked].set(owner, mode="drop")
+    return asked, map_rows(own, asked, num_rows=num_asked, chunk=OWNER_CHUNK), num_asked
 
 
 def _counts(
@@ -134,17 +143,20 @@ def _counts(
     largest_hull: jax.Array,
     config: DetectorConfig,
 ) -> Counts:
-    num = functools.partial(jnp.sum, dtype=jnp.int32)
-    clustered = num(jnp.any(proposals.cluster < proposals.num_points.shape[0], axis=0) & obstacles.present)
-    num_obstacles = num(obstacles.present)
     above = heights.height > config.ground.min_height_m
+    overhead = above & (heights.height >= config.ground.max_height_m)
+    present, finite, valid, inliers, ground, overhead = count_true(
+        sweep.present, sweep.finite, sweep.valid, sweep.inlier, sweep.inlier & ~above, sweep.inlier & overhead
+    )
+    (clustered,) = count_true(jnp.min(proposals.cluster, axis=0) < proposals.num_points.shape[0])
+    num_obstacles = jnp.minimum(obstacles.count, obstacles.row.shape[0])
     return Counts(
-        dropped_points=cloud.num_points - num(sweep.present),
-        nonfinite_points=num(sweep.present & ~sweep.finite),
-        out_of_range_points=num(sweep.finite & ~sweep.valid),
-        outlier_points=num(sweep.valid & ~sweep.inlier),
-        ground_points=num(sweep.inlier & ~above),
-        overhead_points=num(sweep.inlier & above & (heights.height >= config.ground.max_height_m)),
+        dropped_points=cloud.num_points - present,
+        nonfinite_points=present - finite,
+        out_of_range_points=finite - valid,
+        outlier_points=valid - inliers,
+        ground_points=ground,
+        overhead_points=overhead,
         dropped_obstacles=obstacles.count - num_obstacles,
         clustered_points=clustered,
         unclustered_points=num_obstacles - clustered,

@@ -67,14 +67,15 @@ def _hull_points(
     obstacles: Obstacles, proposals: Proposals, config: DetectorConfig
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The hull of each cluster, as the points that its rectangle is fitted to (the paper)."""
-    num_obstacles = obstacles.xy.shape[0]
+    num_maps, num_obstacles = proposals.cluster.shape
     index = hull.extreme_points(
         proposals.cluster.reshape(-1),
-        jnp.tile(obstacles.xy, (len(proposals.maps), 1)),
+        jnp.tile(jnp.arange(num_obstacles), num_maps),
+        jnp.int32(proposals.cluster.size),
+        obstacles.xy,
         num_clusters=proposals.num_points.shape[0],
         num_slices=config.hull.num_slices,
     )
-    index = jnp.where(index < proposals.cluster.size, index % num_obstacles, num_obstacles)
     trace = functools.partial(trace_hulls, obstacles.xy, max_vertices=config.hull.max_vertices)
     vertices, count = map_rows(trace, index, num_rows=proposals.num_clusters, chunk=HULL_CHUNK)
     return vertices, jnp.minimum(count, config.hull.max_vertices), jnp.max(count)

@@ -9,12 +9,15 @@ import jax.numpy as jnp
 from jaxbox import evidence, vehicles
 from jaxbox.config import DetectorConfig
 from jaxbox.geometry import wrap_yaw
-from jaxbox.masked import take
+from jaxbox.masked import compact, take
 from jaxbox.steps.boxes import cast_rays
 from jaxbox.steps.common import class_values, stage_options
 from jaxbox.steps.points import Heights, Obstacles, height_above_ground
 from jaxbox.steps.proposals import Proposals, Trials
 from jaxbox.types import NOT_A_BOX, Boxes
+
+RANK_STEP = 16
+"""Rows that all others are compared with in one step."""
 
 
 @jax.tree_util.register_dataclass
@@ -44,7 +47,7 @@ def score_boxes(
     """Scores the boxes by rays and size, then the best of them by what surrounds them."""
     settings = config.vehicles
     score = _early_score(trials, boxes, proposals, seen, config)
-    chosen, num = _best(score, settings.max_candidates, settings.min_score)
+    chosen, num = _choose(score, settings.max_candidates, settings.min_score)
     rectangle = jnp.concatenate(
         [boxes.center, jnp.stack([boxes.length, boxes.width, wrap_yaw(boxes.yaw)], axis=1)], axis=1
     )
@@ -87,10 +90,9 @@ def score_boxes(
     flat = jnp.concatenate([rectangle[:, :2], jnp.zeros_like(rectangle[:, :1])], axis=1)
     bottom = above - height_above_ground(flat, heights.planes, heights.surface, config)
     total = jnp.where(chosen < score.shape[0], take(score, chosen) * late, 0)
-    order, _ = _best(total, settings.max_candidates, settings.min_score)
-    unsorted = Candidates(
-        rectangle, bottom, height, total, label, cluster, total > settings.min_score, jnp.zeros_like(label)
-    )
+    total = jnp.where(total > settings.min_score, total, 0)
+    order = _best_first(total, num)
+    unsorted = Candidates(rectangle, bottom, height, total, label, cluster, total > 0, jnp.zeros_like(label))
     ordered = jax.tree.map(lambda a: take(a, order), unsorted)
     return dataclasses.replace(ordered, num=num)
 
@@ -140,12 +142,37 @@ def _early_score(
     return jnp.where(present & (jnp.max(boxes.measured, axis=1) >= settings.min_extent_m), score, 0)
 
 
-def _best(score: jax.Array, capacity: int, min_score: jax.Array | float) -> tuple[jax.Array, jax.Array]:
-    """Rows with the highest scores above the least, best first (ties by row), and their true number."""
-    size = score.shape[0]
+def _choose(score: jax.Array, capacity: int, min_score: jax.Array | float) -> tuple[jax.Array, jax.Array]:
+    """Rows with scores above the least, the highest where they are too many, and their true number."""
     above = score > min_score
-    _, order = jax.lax.sort((jnp.where(above, -score, 1), jnp.arange(size)), num_keys=1, is_stable=True)
-    num = jnp.sum(above)
-    row = jnp.arange(capacity)
-    order = jnp.pad(order, (0, max(capacity - size, 0)), constant_values=size)[:capacity]
-    return jnp.where(row < num, order, size), num
+    row, num = compact(above, capacity)
+
+    def highest() -> jax.Array:
+        _, order = jax.lax.sort((-score, jnp.arange(score.shape[0])), num_keys=1, is_stable=True)
+        return jnp.sort(order[:capacity])
+
+    if capacity >= score.shape[0]:
+        return row, num
+    return jax.lax.cond(num > capacity, highest, lambda: row), num
+
+
+def _best_first(score: jax.Array, num: jax.Array) -> jax.Array:
+    """Rows with positive scores, which are among the first `num`, best first (ties by row); then their size.
+
+    The place of a row is the number of rows before it: for the few that are there, counting beats a sort.
+    """
+    size = score.shape[0]
+    row = jnp.arange(size)
+    padded = jnp.pad(score, (0, -size % RANK_STEP))
+
+    def step(i: jax.Array, place: jax.Array) -> jax.Array:
+        for k in range(RANK_STEP):
+            other = i * RANK_STEP + k
+            rival = padded[other]
+            place = place + ((rival > score) | ((rival == score) & (other < row)))
+        return place
+
+    place = jax.lax.fori_loop(
+        0, (jnp.minimum(num, size) + RANK_STEP - 1) // RANK_STEP, step, jnp.zeros_like(row)
+    )
+    return jnp.full(size, size).at[jnp.where(score > 0, place, size)].set(row, mode="drop")
