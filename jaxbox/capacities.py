@@ -20,7 +20,7 @@ def rough_counts(config: "DetectorConfig", index: int, xyz: np.ndarray) -> list[
       xyz: (n, 3) m, sensor frame; NaN and infinity are ignored.
 
     Returns:
-      Points above the ground, points that boxes are fitted to, and occupied cells of each map.
+      Points above the ground, points that boxes are fitted to, and runs of occupied cells of each map.
 
     Raises:
       ValueError: for another shape.
@@ -41,8 +41,9 @@ def rough_counts(config: "DetectorConfig", index: int, xyz: np.ndarray) -> list[
     counts = [np.sum(between(config.ground)), np.sum(slab & between(config.ground))]
     for m in config.clustering.maps:
         level = np.minimum((height - m.min_height_m) // m.cell_m, m.num_levels - 1)
-        cells = np.column_stack([drawn // m.cell_m, level])[between(m)]
-        counts.append(len(np.unique(cells, axis=0)))
+        cells = np.unique(np.column_stack([drawn // m.cell_m, level])[between(m)], axis=0)
+        next_in_line = [0, 1, 0] if m.num_levels == 1 else [0, 0, 1]
+        counts.append(len(cells) - np.sum(np.all(np.diff(cells, axis=0) == next_in_line, axis=1)))
     return [int(count) for count in counts]
 
 

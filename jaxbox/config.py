@@ -129,8 +129,9 @@ class ComponentMap:
     """static: edge of the cells; neighbours (also diagonal ones) are linked."""
     num_levels: int = _static(default=1)
     """static: cells in height; 1 is a bird's-eye view map, more is a 3D grid."""
-    max_cells: int = _static(default=16384)
-    """static: capacity for occupied cells."""
+    max_cells: int = _static(default=8192)
+    """static: capacity for occupied cells, where a run of neighbours along y counts once (on a map with
+    levels, a run in height)."""
     max_clusters: int = _static(default=512)
     """static: capacity for clusters that pass the gates."""
     min_height_m: Scalar = 0.2
@@ -148,9 +149,9 @@ class ClusteringConfig:
     """
 
     maps: tuple[ComponentMap, ...] = (
-        ComponentMap(cell_m=0.2, max_cells=14336),
-        ComponentMap(cell_m=0.1, max_cells=20480, min_height_m=0.3, max_height_m=2.0),
-        ComponentMap(cell_m=0.5, max_cells=8192),
+        ComponentMap(cell_m=0.2, max_cells=7168),
+        ComponentMap(cell_m=0.1, max_cells=10240, min_height_m=0.3, max_height_m=2.0),
+        ComponentMap(cell_m=0.5, max_cells=4096),
     )
     """The component maps; the first also gives the scene direction and the components for display."""
     max_obstacles: int | None = _static(default=None)
@@ -359,7 +360,7 @@ class DetectorConfig:
         return cls(
             ground=GroundConfig(candidates="points", surface=False, tolerance_m=0.2),
             clustering=ClusteringConfig(
-                maps=(ComponentMap(cell_m=0.35, num_levels=13, max_cells=24576, max_height_m=4.5),),
+                maps=(ComponentMap(cell_m=0.35, num_levels=13, max_cells=14336, max_height_m=4.5),),
                 adaptive_growth=0.0,
             ),
             evidence=EvidenceConfig(enabled=False),

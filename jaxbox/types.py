@@ -53,8 +53,8 @@ _STATUS_TEXT = {
     Status.NO_GROUND: "no plane had enough support; heights are taken from the lowest candidate instead.",
     Status.OBSTACLE_OVERFLOW: "more points above the ground than clustering.max_obstacles (or, for "
     "the points a box is fitted to, box.max_slab_points); the last in the sweep's order were dropped.",
-    Status.CELL_OVERFLOW: "a component map has more occupied cells than its max_cells; "
-    "points in the cells beyond it belong to no cluster.",
+    Status.CELL_OVERFLOW: "a component map has more runs of occupied cells than its max_cells; "
+    "points in runs beyond those of all maps belong to no cluster.",
     Status.CLUSTER_OVERFLOW: "a component map has more clusters than its max_clusters, and those beyond it "
     "were not examined; or more clusters are high than vehicles.max_large, and those beyond it were "
     "tried as cars only.",
@@ -162,22 +162,28 @@ class GroundPlane:
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Clusters:
-    """The clusters of one component map that pass the size gates."""
+    """The components that pass the size gates, in one list of P rows: map by map, without gaps."""
 
-    slot: jax.Array
-    """(N,) int32: row of each point's cluster, or K where it has none."""
+    row: jax.Array
+    """(C,) int32: row of each component, or P where it is no cluster."""
     num_points: jax.Array
-    """(K,) int32: points of each cluster; 0 for an empty row."""
+    """(P,) int32: points of each cluster; 0 for an empty row."""
+    num_slab: jax.Array
+    """(P,) int32: those of them between the slab's heights."""
     min_height: jax.Array
-    """(K,) float32, m: height above the ground of the cluster's lowest point; 0 for an empty row."""
+    """(P,) float32, m: height above the ground of the cluster's lowest point; 0 for an empty row."""
     max_height: jax.Array
-    """(K,) float32, m: height above the ground of the cluster's highest point; 0 for an empty row."""
-    num_clusters: jax.Array
-    """() int32: clusters that pass the gates, which may exceed K."""
-    num_cells: jax.Array
-    """() int32: occupied cells of the map, which may exceed its capacity."""
-    component: jax.Array
-    """(N,) int32: connected component of each point, before any gate; -1 where it has none."""
+    """(P,) float32, m: height above the ground of the cluster's highest point; 0 for an empty row."""
+    found: jax.Array
+    """(maps,) int32: clusters of each map that pass the gates, which may exceed its capacity."""
+    kept: jax.Array
+    """(maps,) int32: those in the list."""
+
+    def sum_by_map(self, values: jax.Array) -> jax.Array:
+        """(maps,) sums of values (P,) of the clusters over each map."""
+        end = jnp.cumsum(self.kept)[:, None]
+        row = jnp.arange(values.shape[0])
+        return jnp.sum(jnp.where((row >= end - self.kept[:, None]) & (row < end), values, 0), axis=1)
 
 
 @jax.tree_util.register_dataclass
@@ -282,7 +288,7 @@ class Counts:
     """() int32: points of clusters that boxes are fitted to, in the map with most of them, which
     box.max_slab_points must hold."""
     cells: jax.Array
-    """(maps,) int32: occupied cells of each component map."""
+    """(maps,) int32: runs of occupied cells of each component map, which its max_cells must hold."""
     clusters: jax.Array
     """(maps,) int32: clusters of each map that pass the size gates."""
     large_clusters: jax.Array

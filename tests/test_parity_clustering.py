@@ -3,6 +3,7 @@
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import parity
 import pytest
@@ -16,10 +17,23 @@ SETTINGS = parity.CONFIG.clustering
 WARP = {"start_m": SETTINGS.adaptive_start_m, "growth": SETTINGS.adaptive_growth}
 MAPS = {"bird's-eye view": ComponentMap(cell_m=0.35), "3D": DetectorConfig.paper().clustering.maps[0]}
 GATES = parity.select_options(SETTINGS, "min_points", "max_extent_m")
-MAX_CELLS = 2**15
+MAX_RUNS = 2**14
 
-label_components = jax.jit(clustering.label_components, static_argnames=("shape", "max_cells"))
-select_clusters = jax.jit(clustering.select_clusters, static_argnames=("max_cells", "max_clusters"))
+
+@functools.partial(jax.jit, static_argnames=("row", "max_runs"))
+def label_cells(cells, *, row, max_runs):
+    """Components of the maps' cells, (maps, N), and what else is known of them."""
+    flags = jnp.zeros(row.num_flags, jnp.uint8).at[row.flag(cells)].set(1)
+    components = clustering.label_components(flags, row, max_runs=max_runs)
+    return components.at(cells), components
+
+
+@functools.partial(jax.jit, static_argnames="max_clusters")
+def select_clusters(component, xy, height, in_slab, first, *, max_clusters, **gates):
+    statistics = clustering.add_points(clustering.no_statistics(MAX_RUNS), component, xy, height, in_slab)
+    return clustering.select_clusters(statistics, first, max_clusters=max_clusters, **gates)
+
+
 sample_points = jax.jit(box.sample_points, static_argnames=("num_clusters", "max_points"))
 
 
@@ -27,17 +41,16 @@ def cell_options(component_map: ComponentMap):
     return parity.REGION | parity.select_options(component_map, "cell_m", "num_levels", "min_height_m")
 
 
+def in_row(cells, row, i):
+    """Where cells of map i, (n, 3), lie in the row of all maps."""
+    return row.starts[i] + cells @ np.array(row.strides[i])
+
+
 def members_of(case, component_map):
     """x, y and height of the obstacles that the map takes, float32."""
     height = case.obstacles.height
     member = (height > component_map.min_height_m) & (height < component_map.max_height_m)
     return case.obstacles.xyz[member, :2].astype(np.float32), height[member].astype(np.float32)
-
-
-def assert_one_partition(first, second):
-    """Fails unless two labellings of the same points group them alike, whatever the labels."""
-    pairs = np.unique(np.column_stack([first, second]), axis=0)
-    assert len(pairs) == len(np.unique(first)) == len(np.unique(second))
 
 
 def test_warped_points_are_those_of_the_reference(cases):
@@ -50,55 +63,90 @@ def test_warped_points_are_those_of_the_reference(cases):
             parity.assert_within(np.asarray(warped)[: len(xy)] - expected, 5e-5, "m between warped points")
 
 
-@pytest.mark.parametrize("name", list(MAPS))
-def test_cells_are_those_of_the_reference(cases, name):
-    cells = jax.jit(lambda xy, height: clustering.cell_index(xy, height, **cell_options(MAPS[name]))[0])
+def test_cells_are_those_of_the_reference(cases):
+    maps = list(MAPS.values())
+    row = clustering.arrange_cells([m.cell_m for m in maps], [m.num_levels for m in maps], **parity.REGION)
+    limits = {f"{end}_height_m": [getattr(m, f"{end}_height_m") for m in maps] for end in ("min", "max")}
+    find = functools.partial(
+        clustering.find_cells, row=row, cell_m=[m.cell_m for m in maps], **limits, **parity.REGION
+    )
     for case in cases:
-        xy, height = members_of(case, MAPS[name])
-        expected, _ = reference.grid_cells(xy.astype(float), height.astype(float), **cell_options(MAPS[name]))
-        index = cells(parity.pad(xy, parity.MAX_OBSTACLES), parity.pad(height, parity.MAX_OBSTACLES))
-        differ = np.any(np.asarray(index)[: len(xy)] != expected, axis=1)
-        # A point on the edge of a cell may round either way; KITTI keeps whole millimetres, so of points on
-        # a grid of 35 cm one in 175 lies on an edge.
-        parity.assert_share(differ.sum(), len(xy), 0.005, f"cells {name}")
-        assert np.max(np.abs(np.asarray(index)[: len(xy)] - expected)) <= 1
+        xy, height = case.obstacles.xyz[:, :2].astype(np.float32), case.obstacles.height.astype(np.float32)
+        padded = [parity.pad(values, parity.MAX_OBSTACLES) for values in (xy, height)]
+        found = jax.jit(find)(*padded, parity.padded_mask(len(xy), parity.MAX_OBSTACLES))
+        for i, component_map in enumerate(maps):
+            cells, shape = reference.grid_cells(
+                xy.astype(float), height.astype(float), **cell_options(component_map)
+            )
+            assert shape == row.shapes[i]
+            member = (height > component_map.min_height_m) & (height < component_map.max_height_m)
+            expected = np.where(member, in_row(cells, row, i), clustering.NONE)
+            cell = np.asarray(found[i])
+            assert (cell[len(xy) :] == clustering.NONE).all()
+            assert ((cell == clustering.NONE)[: len(xy)] == ~member).all()
+            # A point on the edge of a cell may round either way; KITTI keeps whole millimetres, so of points
+            # on a grid of 35 cm one in 175 lies on an edge.
+            differ = cell[: len(xy)] != expected
+            parity.assert_share(differ.sum(), member.sum(), 0.005, f"cells of map {i}")
+            steps = np.abs(cell[: len(xy)] - expected)[differ]
+            assert np.isin(steps, row.strides[i]).all()
 
 
-@pytest.mark.parametrize("name", list(MAPS))
-def test_components_are_exactly_those_of_the_reference(cases, name):
+def test_components_are_exactly_those_of_the_reference(cases):
     for case in cases:
-        cells, shape = reference.grid_cells(*members_of(case, MAPS[name]), **cell_options(MAPS[name]))
-        expected = reference.label_components(cells, shape)
-        component, num_cells = label_components(
-            parity.pad(cells, parity.MAX_OBSTACLES),
-            parity.padded_mask(len(cells), parity.MAX_OBSTACLES),
-            shape=shape,
-            max_cells=MAX_CELLS,
-        )
-        component = np.asarray(component)
-        assert int(num_cells) == len(np.unique(cells, axis=0)) < MAX_CELLS
-        assert np.all(component[len(cells) :] == MAX_CELLS)
-        assert_one_partition(component[: len(cells)], expected)
-        assert expected.max() > 20
+        grids = [reference.grid_cells(*members_of(case, m), **cell_options(m)) for m in MAPS.values()]
+        row = clustering.CellRow(tuple(shape for _, shape in grids))
+        cells = [
+            parity.pad(in_row(cells, row, i), parity.MAX_OBSTACLES) for i, (cells, _) in enumerate(grids)
+        ]
+        component, components = label_cells(np.stack(cells), row=row, max_runs=MAX_RUNS)
+        component, first = np.asarray(component), np.asarray(components.first)
+        for i, (cells, shape) in enumerate(grids):
+            expected = reference.label_components(cells, shape)
+            np.testing.assert_array_equal(component[i, : len(cells)], first[i] + expected)
+            assert (component[i, len(cells) :] == clustering.NONE).all()
+            assert int(components.num_runs[i]) == reference.count_runs(cells, shape)
+            assert first[i + 1] - first[i] == expected.max() + 1 > 20
 
 
-@pytest.mark.parametrize("shape", [(61, 67, 1), (17, 19, 13)])
-def test_components_of_random_grids_are_those_of_scipy(shape):
+SHAPES = {
+    "one map": ((61, 67, 1),),
+    "one line": ((1, 500, 1),),
+    "lines of one": ((500, 1, 1),),
+    "3D": ((17, 19, 13),),
+    "many": ((61, 67, 1), (17, 19, 13), (40, 31, 2), (5, 1000, 1)),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_components_of_random_grids_are_those_of_scipy(name):
     # From single cells to one component, past the density at which paths are longest.
     rng = np.random.default_rng(0)
+    row = clustering.CellRow(SHAPES[name])
+    size = max(np.prod(shape) for shape in SHAPES[name])
     for density in np.linspace(0.02, 0.6, 25):
-        occupied = rng.random(shape) < density
-        cells = np.argwhere(occupied)
-        labels, _ = ndimage.label(occupied, np.ones((3, 3, 3)))
-        order = rng.permutation(len(cells))
-        component, num_cells = label_components(
-            parity.pad(cells[order], occupied.size),
-            parity.padded_mask(len(cells), occupied.size),
-            shape=shape,
-            max_cells=occupied.size,
-        )
-        assert_one_partition(np.asarray(component)[: len(cells)], labels[occupied][order])
-        assert int(num_cells) == len(cells)
+        grids = [rng.random(shape) < density for shape in SHAPES[name]]
+        where = [rng.permutation(np.argwhere(grid)) for grid in grids]
+        cells = np.stack([parity.pad(in_row(c, row, i), size) for i, c in enumerate(where)])
+        component, components = label_cells(cells, row=row, max_runs=MAX_RUNS)
+        for i, grid in enumerate(grids):
+            labels = np.zeros(grid.shape, np.int32)
+            ndimage.label(grid, np.ones((3, 3, 3)), output=labels)
+            # Numbered by the first cell.
+            _, place, number = np.unique(labels[grid], return_index=True, return_inverse=True)
+            labels[grid] = np.argsort(np.argsort(place))[number]
+            expected = int(components.first[i]) + labels[tuple(where[i].T)]
+            np.testing.assert_array_equal(np.asarray(component)[i, : len(expected)], expected)
+
+
+def test_runs_beyond_the_capacity_belong_to_no_component():
+    cells = np.stack([np.arange(0, 400, 2) % 20, np.arange(0, 400, 2) // 20 * 2, np.zeros(200)], axis=1)
+    row = clustering.CellRow(((20, 40, 1),))
+    cells = in_row(cells.astype(np.int32), row, 0)[None]
+    for capacity in (201, 200, 100, 1):
+        component, components = label_cells(cells, row=row, max_runs=capacity)
+        assert int(components.num_runs[0]) == 200
+        assert (np.asarray(component) == clustering.NONE).sum() == max(201 - capacity, 0)
 
 
 @pytest.mark.parametrize("name", list(MAPS))
@@ -107,23 +155,49 @@ def test_clusters_that_pass_the_gates_are_exactly_those_of_the_reference(cases, 
         xy, height = members_of(case, MAPS[name])
         component = reference.label_components(*reference.grid_cells(xy, height, **cell_options(MAPS[name])))
         slot, count = reference.keep_clusters(xy, component, **GATES)
+        in_slab = np.arange(len(xy)) % 3 == 0
         clusters = select_clusters(
-            parity.pad(component, parity.MAX_OBSTACLES, fill=MAX_CELLS),
+            [parity.pad(1 + component, parity.MAX_OBSTACLES)],
             parity.pad(xy, parity.MAX_OBSTACLES),
             parity.pad(height, parity.MAX_OBSTACLES),
-            np.int32(0),
-            max_cells=MAX_CELLS,
-            max_clusters=parity.MAX_CLUSTERS,
+            parity.pad(in_slab, parity.MAX_OBSTACLES),
+            np.array([1, 2 + component.max()]),
+            max_clusters=(parity.MAX_CLUSTERS,),
             **GATES,
         )
         clusters = parity.on_host(clusters)
         expected = np.where(slot == NO_CLUSTER, parity.MAX_CLUSTERS, slot)
-        np.testing.assert_array_equal(clusters.slot[: len(xy)], expected)
-        assert int(clusters.num_clusters) == count > 10
+        np.testing.assert_array_equal(clusters.row[1 + component], expected)
+        assert clusters.row[0] == parity.MAX_CLUSTERS
+        assert clusters.found[0] == clusters.kept[0] == count > 10
         np.testing.assert_array_equal(clusters.num_points[:count], np.bincount(slot[slot >= 0]))
+        np.testing.assert_array_equal(
+            clusters.num_slab[:count], np.bincount(slot[slot >= 0], in_slab[slot >= 0])
+        )
         heights = [height[slot == k] for k in range(count)]
         np.testing.assert_array_equal(clusters.min_height[:count], [h.min() for h in heights])
         np.testing.assert_array_equal(clusters.max_height[:count], [h.max() for h in heights])
+
+
+def test_the_lists_of_the_maps_join_without_gaps_and_end_at_their_capacities():
+    # Map 0 has components 1 to 4, map 1 has 5 and 6, map 2 has 7 to 9; each of one point but 2 and 7.
+    component = np.array([1, 3, 4, 5, 6, 8, 9, 2, 2, 7, 7], np.int32)
+    xy = np.zeros((11, 2), np.float32)
+    xy[[8, 10]] = 50.0
+    for sizes, rows in (
+        ((4, 4, 4), {1: 0, 3: 1, 4: 2, 5: 3, 6: 4, 8: 5, 9: 6}),
+        ((2, 1, 3), {1: 0, 3: 1, 5: 2, 8: 3, 9: 4}),
+    ):
+        clusters = select_clusters(
+            [component], xy, np.zeros(11), np.ones(11, bool), np.array([1, 5, 7, 10]), max_clusters=sizes,
+            min_points=1.0, max_extent_m=12.0,
+        )  # fmt: skip
+        none = sum(sizes)
+        assert clusters.found.tolist() == [3, 2, 2]
+        assert clusters.kept.tolist() == np.minimum([3, 2, 2], sizes).tolist()
+        assert clusters.row[:10].tolist() == [rows.get(c, none) for c in range(10)]
+        assert clusters.num_points.tolist() == [1] * len(rows) + [0] * (none - len(rows))
+        assert clusters.sum_by_map(clusters.num_points).tolist() == clusters.kept.tolist()
 
 
 def test_fitted_points_are_exactly_those_of_the_reference(cases):

@@ -202,8 +202,8 @@ SMALL = DetectorConfig(
     ground=GroundConfig(surface=False),
     clustering=ClusteringConfig(
         maps=(
-            ComponentMap(cell_m=0.35, max_cells=1080, max_clusters=40),
-            ComponentMap(cell_m=0.5, max_cells=750, max_clusters=40),
+            ComponentMap(cell_m=0.35, max_cells=640, max_clusters=40),
+            ComponentMap(cell_m=0.5, max_cells=480, max_clusters=40),
         ),
         max_obstacles=6500,
     ),

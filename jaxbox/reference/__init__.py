@@ -16,6 +16,7 @@ from jaxbox.reference.boxes import (
 )
 from jaxbox.reference.clusters import (
     NO_CLUSTER,
+    count_runs,
     euclidean_clusters,
     grid_cells,
     keep_clusters,
@@ -82,6 +83,7 @@ __all__ = [
     "complete_extent",
     "convex_hull",
     "count_points_around",
+    "count_runs",
     "criterion_curve",
     "depth_behind_faces",
     "detect",

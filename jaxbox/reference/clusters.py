@@ -87,6 +87,25 @@ def label_components(cells: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     return rank[labels[tuple(cells.T)] - 1]
 
 
+def count_runs(cells: np.ndarray, shape: tuple[int, int, int]) -> int:
+    """Runs of occupied cells: neighbours along y, or in height where the grid has levels, count once.
+
+    Args:
+      cells: (n, 3) int, the cell of each point.
+      shape: of the grid.
+
+    Returns:
+      Their number.
+
+    >>> count_runs(np.array([[5, 5, 0], [5, 6, 0], [5, 6, 0], [6, 5, 0]]), (8, 8, 1))
+    2
+    """
+    occupied = np.zeros(shape, bool)
+    occupied[tuple(cells.T)] = True
+    line = np.moveaxis(occupied, 1 if shape[2] == 1 else 2, 0)
+    return int(line[0].sum() + (line[1:] & ~line[:-1]).sum())
+
+
 def keep_clusters(
     xy: np.ndarray, component: np.ndarray, *, min_points: float, max_extent_m: float
 ) -> tuple[np.ndarray, int]:

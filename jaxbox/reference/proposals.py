@@ -9,7 +9,14 @@ from scipy.spatial import KDTree
 from jaxbox.class_priors import ClassPrior
 from jaxbox.config import ComponentMap
 from jaxbox.reference.boxes import convex_hull, criterion_curve, fit_points
-from jaxbox.reference.clusters import NO_CLUSTER, grid_cells, keep_clusters, label_components, warp_range
+from jaxbox.reference.clusters import (
+    NO_CLUSTER,
+    count_runs,
+    grid_cells,
+    keep_clusters,
+    label_components,
+    warp_range,
+)
 from jaxbox.reference.completion import (
     CompletedBox,
     Reading,
@@ -110,7 +117,7 @@ def find_clusters(
 
     Returns:
       Component (m,) and cluster (m,) of each obstacle, `NO_CLUSTER` where it has none, and the
-      numbers of occupied cells and of clusters.
+      numbers of runs of occupied cells and of clusters.
     """
     fields: Any = component_map
     clustering = settings.clustering
@@ -128,7 +135,7 @@ def find_clusters(
     gates = select_options(clustering, "min_points", "max_extent_m")
     slot[member], num_clusters = keep_clusters(xy, component[member], **gates)
     slot[slot >= fields.max_clusters] = NO_CLUSTER
-    return component, slot, (len(np.unique(cells, axis=0)), num_clusters)
+    return component, slot, (count_runs(cells, shape), num_clusters)
 
 
 def make_proposals(obstacles: Obstacles, slot: np.ndarray, settings: Any) -> list[Proposal]:

@@ -140,7 +140,7 @@ def _scene_preference(
 ) -> jax.Array:
     """The direction that the first map's boxes, fitted without a preference, vote for."""
     settings = config.box
-    size = proposals.maps[0].num_points.shape[0]
+    size = config.clustering.maps[0].max_clusters
     rectangles = jax.tree.map(lambda a: a[:size], best_rectangles(fits, jnp.zeros(settings.num_angles)))
     long = longest_side(rectangles) >= settings.direction_min_extent_m
     cluster, num = compact(long & (jnp.arange(size) < proposals.num_first), size)

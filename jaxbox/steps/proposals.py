@@ -2,7 +2,8 @@
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,10 +11,13 @@ import jax.numpy as jnp
 from jaxbox import clustering
 from jaxbox.class_priors import ClassPrior
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import compact
+from jaxbox.masked import apart, compact, lookup, take
 from jaxbox.steps.common import stage_options
 from jaxbox.steps.points import Obstacles
 from jaxbox.types import Clusters, Label, Rectangles
+
+CHUNK = 8192
+"""Points looked up at a time."""
 
 LOWER_PART_M = 0.5
 """A cluster may be so much lower than its vehicle: the rest is another cluster, or outside the map."""
@@ -24,8 +28,10 @@ LOWER_PART_M = 0.5
 class Proposals:
     """The clusters of all maps in one list, and the classes each is tried as."""
 
-    maps: tuple[Clusters, ...]
+    component: jax.Array  # (O,) connected component of each point on the first map, -1 for none
     cluster: jax.Array  # (maps, O) row of each point's cluster in the list, P for none
+    num_runs: jax.Array  # (maps,) runs of occupied cells
+    num_found: jax.Array  # (maps,) clusters that pass the gates
     num_clusters: jax.Array  # ()
     num_first: jax.Array  # () those of the first map, which come first
     num_points: jax.Array  # (P,)
@@ -39,90 +45,146 @@ class Proposals:
 
 def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Proposals:
     """Labels the components of every map, and lists the clusters that pass the size gates."""
-    settings = config.clustering
-    xy = clustering.warp_range(
-        obstacles.xy, start_m=settings.adaptive_start_m, growth=settings.adaptive_growth
+    settings, maps = config.clustering, config.clustering.maps
+    cells = clustering.arrange_cells(
+        [m.cell_m for m in maps], [m.num_levels for m in maps], **stage_options(config.region)
     )
-    maps = []
-    for m in settings.maps:
-        above, below = obstacles.height > m.min_height_m, obstacles.height < m.max_height_m
-        index, shape = clustering.cell_index(
-            xy,
-            obstacles.height,
-            cell_m=m.cell_m,
-            num_levels=m.num_levels,
-            min_height_m=m.min_height_m,
-            **stage_options(config.region),
-        )
-        component, num_cells = clustering.label_components(
-            index, obstacles.present & above & below, shape=shape, max_cells=m.max_cells
-        )
-        maps.append(
-            clustering.select_clusters(
-                component,
-                obstacles.xy,
-                obstacles.height,
-                num_cells,
-                max_cells=m.max_cells,
-                max_clusters=m.max_clusters,
-                min_points=settings.min_points,
-                max_extent_m=settings.max_extent_m,
-            )
-        )
-    return _list_proposals(tuple(maps), obstacles, config)
-
-
-def _list_proposals(maps: tuple[Clusters, ...], obstacles: Obstacles, config: DetectorConfig) -> Proposals:
-    sizes = [m.num_points.shape[0] for m in maps]
-    total = sum(sizes)
-    kept = [jnp.minimum(m.num_clusters, size) for m, size in zip(maps, sizes, strict=True)]
-    # The lists join without gaps, so that work on them ends with the last cluster.
-    offset = [sum(kept[:i], jnp.int32(0)) for i in range(len(maps))]
-    cluster = jnp.stack(
-        [jnp.where(m.slot < size, m.slot + o, total) for m, size, o in zip(maps, sizes, offset, strict=True)]
+    cell, flags = _find_cells(obstacles, cells, config)
+    components = clustering.label_components(flags, cells, max_runs=sum(m.max_cells for m in maps))
+    component, statistics = _find_components(obstacles, cell, components, config)
+    clusters = clustering.select_clusters(
+        statistics,
+        components.first,
+        max_clusters=[m.max_clusters for m in maps],
+        min_points=settings.min_points,
+        max_extent_m=settings.max_extent_m,
     )
-
-    def join(field: str) -> jax.Array:
-        values = [getattr(m, field) for m in maps]
-        joined = jnp.zeros(total, values[0].dtype)
-        for value, o, k in zip(values, offset, kept, strict=True):
-            slot = jnp.arange(value.shape[0])
-            joined = joined.at[jnp.where(slot < k, slot + o, total)].set(value, mode="drop")
-        return joined
-
-    max_height = join("max_height")
-    min_height, num_points = join("min_height"), join("num_points")
-    settings = config.vehicles
-    is_large = (max_height > settings.large_height_m) & (min_height < settings.large_clearance_m)
-    is_large = is_large & (num_points >= settings.large_min_points)
-    large, num_large = compact(is_large, settings.max_large)
-    fitted = _fitted(cluster, obstacles, total, config)
-    num_slab = jnp.max(jnp.sum(fitted, axis=1))
+    all_fitted = clusters.num_slab < config.box.min_slab_points
+    cluster, fitted = _find_clusters(obstacles, component, clusters.row, all_fitted, config)
+    num_fitted = jnp.where(all_fitted, clusters.num_points, clusters.num_slab)
+    large, num_large = _large_clusters(clusters, config)
+    num = obstacles.height.shape[0]
     return Proposals(
-        maps,
-        cluster,
-        sum(kept, jnp.int32(0)),
-        kept[0],
-        num_points,
-        min_height,
-        max_height,
-        fitted,
-        num_slab,
-        large,
-        num_large,
+        component=component[0, :num] - 1,
+        cluster=cluster[:, :num],
+        num_runs=components.num_runs,
+        num_found=clusters.found,
+        num_clusters=jnp.sum(clusters.kept),
+        num_first=clusters.kept[0],
+        num_points=clusters.num_points,
+        min_height=clusters.min_height,
+        max_height=clusters.max_height,
+        fitted=fitted[:, :num],
+        num_slab=jnp.max(clusters.sum_by_map(num_fitted)),
+        large=large,
+        num_large=num_large,
     )
 
 
-def _fitted(cluster: jax.Array, obstacles: Obstacles, num_clusters: int, config: DetectorConfig) -> jax.Array:
-    """(maps, O) points between the slab's heights, or all of the clusters that have few of those."""
-    settings = config.box
-    in_slab = (obstacles.height > settings.slab_min_height_m) & (
-        obstacles.height < settings.slab_max_height_m
+def _fold_chunks(step: Callable[[jax.Array, Any], Any], init: Any, obstacles: Obstacles) -> Any:
+    """Calls a step with the first row of each chunk that holds points, and its state."""
+    num_chunks = (jnp.minimum(obstacles.count, obstacles.height.shape[0]) + CHUNK - 1) // CHUNK
+    return jax.lax.fori_loop(0, num_chunks, lambda i, state: step(i * CHUNK, state), init)
+
+
+def _chunk(values: jax.Array, start: jax.Array) -> jax.Array:
+    """Rows of a chunk; zeros beyond the last."""
+    whole = jnp.pad(values, [(0, -values.shape[0] % CHUNK)] + [(0, 0)] * (values.ndim - 1))
+    return jax.lax.dynamic_slice_in_dim(whole, start, CHUNK)
+
+
+def _on_map(table: jax.Array, i: int, start: jax.Array) -> jax.Array:
+    """(CHUNK,) what a table (maps, O) says of a chunk of points on map i."""
+    return jax.lax.dynamic_slice(table, (i, start), (1, CHUNK))[0]
+
+
+def _store(table: jax.Array, i: int, start: jax.Array, values: jax.Array) -> jax.Array:
+    return jax.lax.dynamic_update_slice(table, values[None], (i, start))
+
+
+def _find_cells(
+    obstacles: Obstacles, cells: clustering.CellRow, config: DetectorConfig
+) -> tuple[jax.Array, jax.Array]:
+    """The cell of each point on each map, (maps, O), and the flags of the occupied cells."""
+    settings, maps = config.clustering, config.clustering.maps
+    warp = functools.partial(
+        clustering.warp_range, start_m=settings.adaptive_start_m, growth=settings.adaptive_growth
     )
-    count = jnp.zeros(num_clusters + 1)
-    for row in cluster:
-        count = count.at[row].add(in_slab)
-    return (cluster < num_clusters) & (in_slab | (count[cluster] < settings.min_slab_points))
+    find = functools.partial(
+        clustering.find_cells,
+        row=cells,
+        cell_m=[m.cell_m for m in maps],
+        min_height_m=[m.min_height_m for m in maps],
+        max_height_m=[m.max_height_m for m in maps],
+        **stage_options(config.region),
+    )
+
+    def step(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        table, flags = state
+        present = start + jnp.arange(CHUNK) < obstacles.count
+        xy = apart(warp, _chunk(obstacles.xy, start), proof=obstacles.count >= 0)
+        for i, cell in enumerate(find(xy, _chunk(obstacles.height, start), present)):
+            flags = flags.at[cells.flag(cell)].set(1, mode="promise_in_bounds")
+            table = _store(table, i, start, cell)
+        return table, flags
+
+    size = obstacles.height.shape[0]
+    table = jnp.zeros((len(maps), size + -size % CHUNK), jnp.int32)
+    return _fold_chunks(step, (table, jnp.zeros(cells.num_flags, jnp.uint8)), obstacles)
+
+
+def _find_components(
+    obstacles: Obstacles, cell: jax.Array, components: clustering.Components, config: DetectorConfig
+) -> tuple[jax.Array, clustering.Statistics]:
+    """The component of each point on each map, (maps, O), and the statistics of the components."""
+
+    def step(start: jax.Array, state: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        table, statistics = state
+        found = [components.at(_on_map(cell, i, start)) for i in range(len(cell))]
+        for i, component in enumerate(found):
+            table = _store(table, i, start, component)
+        height = _chunk(obstacles.height, start)
+        slab = _in_slab(height, config)
+        return table, clustering.add_points(statistics, found, _chunk(obstacles.xy, start), height, slab)
+
+    statistics = clustering.no_statistics(components.of_run.shape[0])
+    return _fold_chunks(step, (jnp.zeros_like(cell), statistics), obstacles)
+
+
+def _in_slab(height: jax.Array, config: DetectorConfig) -> jax.Array:
+    return (height > config.box.slab_min_height_m) & (height < config.box.slab_max_height_m)
+
+
+def _find_clusters(
+    obstacles: Obstacles, component: jax.Array, row: jax.Array, all_fitted: jax.Array, config: DetectorConfig
+) -> tuple[jax.Array, jax.Array]:
+    """The cluster of each point on each map, and whether a box is fitted to it.
+
+    Boxes are fitted to points between the slab's heights, or to all of the clusters that have few of those.
+    """
+    num_clusters = all_fitted.shape[0]
+    # One look-up answers both.
+    code = 2 * row + take(all_fitted, row)
+
+    def step(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        table, fitted = state
+        in_slab = _in_slab(_chunk(obstacles.height, start), config)
+        for i in range(len(component)):
+            found = lookup(code, _on_map(component, i, start))
+            cluster, every = found >> 1, found & 1 == 1
+            table = _store(table, i, start, cluster)
+            fitted = _store(fitted, i, start, (cluster < num_clusters) & (in_slab | every))
+        return table, fitted
+
+    init = jnp.full(component.shape, num_clusters), jnp.zeros(component.shape, bool)
+    return _fold_chunks(step, init, obstacles)
+
+
+def _large_clusters(clusters: Clusters, config: DetectorConfig) -> tuple[jax.Array, jax.Array]:
+    settings = config.vehicles
+    stands = clusters.min_height < settings.large_clearance_m
+    enough = clusters.num_points >= settings.large_min_points
+    return compact((clusters.max_height > settings.large_height_m) & stands & enough, settings.max_large)
 
 
 @jax.tree_util.register_dataclass
