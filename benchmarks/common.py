@@ -7,7 +7,8 @@ import os
 import pathlib
 import platform
 import subprocess
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -16,7 +17,7 @@ import numpy as np
 import jaxbox
 from jaxbox import Detections, DetectorConfig, PointCloud, Status
 from jaxbox.cli.cache import enable_cache
-from jaxbox.io import atomic_writer
+from jaxbox.io import Sweep, atomic_writer, open_sweeps
 from jaxbox.settings import parse_change, replace_settings
 
 PROJECT = pathlib.Path(__file__).resolve().parents[1]
@@ -25,6 +26,9 @@ DATA_VARIABLE = "JAXBOX_DATA"
 """Environment variable that names the folder of real sweeps; by default ``../shared/data``."""
 
 PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "opencv-python-headless")
+
+SWEEP_SETS = ("kitti_object", "kitti_tracking", "kitti_raw")
+"""Data sets of one sensor, whose sweeps are timed."""
 
 
 def data_folder(name: str) -> pathlib.Path:
@@ -35,8 +39,20 @@ def data_folder(name: str) -> pathlib.Path:
     return root / name
 
 
-def parser(description: str, *, preset: bool = True) -> argparse.ArgumentParser:
-    """A parser with the options of every benchmark; without the preset's where the benchmark chooses it."""
+def kitti_sweeps(limit: int | None = None) -> list[Sweep]:
+    """Real sweeps of the three KITTI data sets; evenly spread ones where only so many are wanted."""
+    folders = [data_folder(SWEEP_SETS[0])]
+    folders += [folder for name in SWEEP_SETS[1:] if (folder := folders[0].parent / name).is_dir()]
+    sweeps = [sweep for folder in folders for sweep in open_sweeps(folder)]
+    step = 1 if limit is None else max(len(sweeps) / limit, 1)
+    return [sweeps[int(i * step)] for i in range(int(len(sweeps) / step))]
+
+
+def parser(description: str, *, preset: bool = True, quick: str | None = None) -> argparse.ArgumentParser:
+    """A parser with the options of every benchmark.
+
+    Without the preset's where the benchmark chooses it; with ``--quick`` where its help is given.
+    """
     options = argparse.ArgumentParser(description=description)
     if preset:
         options.add_argument("--preset", choices=sorted(DetectorConfig.presets()), default="default")
@@ -47,6 +63,8 @@ def parser(description: str, *, preset: bool = True) -> argparse.ArgumentParser:
         metavar="FIELD=VALUE",
         help="change one setting, such as vehicles.max_overlap=0.2 or clustering.maps.0.cell_m=0.3",
     )
+    if quick is not None:
+        options.add_argument("--quick", action="store_true", help=quick)
     options.add_argument("--json", type=pathlib.Path, help="also write the report to this file")
     return options
 
@@ -109,6 +127,19 @@ def installed_version(name: str) -> str | None:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return None
+
+
+def milliseconds(function: Callable[[], Any]) -> tuple[float, Any]:
+    """Time of one call, until its result is ready, and the result."""
+    start = time.perf_counter()
+    result = jax.block_until_ready(function())
+    return 1e3 * (time.perf_counter() - start), result
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Least, median, 90th and 99th percentile (ms), and how many runs."""
+    least, median, p90, p99 = np.percentile(values, [0, 50, 90, 99])
+    return {"min": least, "median": median, "p90": p90, "p99": p99, "runs": len(values)}
 
 
 def write_report(report: dict[str, Any], options: argparse.Namespace) -> None:

@@ -36,11 +36,31 @@ def detect(
 
     Reference: paper, section 3; oracle `jaxbox.reference.detect`.
     """
+    return _detect_jit(*_operands(cloud, config, key))
+
+
+def lower(
+    cloud: PointCloud, config: DetectorConfig | None = None, key: jax.Array | None = None
+) -> jax.stages.Lowered:
+    """The program of `detect` before it is compiled, for its text, its cost and its memory.
+
+    Args:
+      cloud: any of the capacity.
+      config: as `detect` takes it.
+      key: as `detect` takes it.
+
+    Returns:
+      What `jax.jit(...).lower` gives.
+    """
+    return _detect_jit.lower(*_operands(cloud, config, key))  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
+
+
+def _operands(
+    cloud: PointCloud, config: DetectorConfig | None, key: jax.Array | None
+) -> tuple[PointCloud, DetectorConfig, jax.Array]:
     config = DetectorConfig() if config is None else config
     steps.check_settings(config)
-    config = jax.tree.map(_as_float, config)
-    key = jax.random.key(0) if key is None else key
-    return _detect_jit(cloud, config, key)
+    return cloud, jax.tree.map(_as_float, config), jax.random.key(0) if key is None else key
 
 
 def count_compilations() -> int:

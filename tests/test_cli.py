@@ -15,7 +15,14 @@ from typer.testing import CliRunner
 import jaxbox
 from jaxbox import synthetic
 from jaxbox.cli import app, cache, demo, eval_pictures
-from jaxbox.cli.report import SHOWN_MIN_SCORE, FrameReport, RunReport, describe_frame, describe_run
+from jaxbox.cli.report import (
+    SHOWN_MIN_SCORE,
+    FrameOutcome,
+    FrameReport,
+    RunReport,
+    describe_frame,
+    describe_run,
+)
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation.report import read_folders
 from jaxbox.io import (
@@ -392,7 +399,7 @@ def test_every_status_bit_is_described_for_a_sweep_and_counted_for_a_run(kitti_f
     frame = FrameReport(name="a", num_points=0, detections=detections, detect_s=0.1, other_s=0.1)
     lines = describe_frame(frame)
     assert len(lines) == 1 + len([bit for bit in Status if bit])
-    summary = "\n".join(describe_run(RunReport(frames=[frame], failures=[("b", "why")]), {}))
+    summary = "\n".join(describe_run(RunReport(frames=[FrameOutcome.of(frame)], failures=[("b", "why")]), {}))
     assert all(f"{bit.name} in 1 of 1 sweeps" in summary for bit in Status if bit)
     assert "failed: b: why" in summary
 

@@ -11,7 +11,14 @@ import numpy as np
 
 from jaxbox import io
 from jaxbox.cli.console import ExitCode, make_progress, print_error, stderr, stdout
-from jaxbox.cli.report import SHOWN_MIN_SCORE, FrameReport, RunReport, describe_frame, describe_run
+from jaxbox.cli.report import (
+    SHOWN_MIN_SCORE,
+    FrameOutcome,
+    FrameReport,
+    RunReport,
+    describe_frame,
+    describe_run,
+)
 from jaxbox.cli.timing import TimedDetector
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation.iou import image_fractions
@@ -108,7 +115,7 @@ def _run_frame(sweep: io.Sweep, detector: TimedDetector, options: DetectOptions,
         run.failures.append((sweep.name, str(error)))
         print_error(f"sweep {sweep.name}: {error}")
         return
-    run.frames.append(report)
+    run.frames.append(FrameOutcome.of(report))
     if not options.quiet:
         for line in describe_frame(report, min_score=max(SHOWN_MIN_SCORE, options.min_score)):
             stdout().print(line, markup=False)

@@ -31,11 +31,28 @@ class FrameReport:
     """Seconds of reading, writing and drawing."""
 
 
+@dataclasses.dataclass(frozen=True)
+class FrameOutcome:
+    """What is kept of a sweep until the end of the run: its detections would fill the memory."""
+
+    detect_s: float
+    """Seconds in the detector, without compiling."""
+    other_s: float
+    """Seconds of reading, writing and drawing."""
+    status: Status
+    """What happened."""
+
+    @classmethod
+    def of(cls, report: FrameReport) -> "FrameOutcome":
+        """The outcome of a sweep that went through."""
+        return cls(report.detect_s, report.other_s, Status(int(report.detections.status)))
+
+
 @dataclasses.dataclass
 class RunReport:
     """All sweeps of a run."""
 
-    frames: list[FrameReport] = dataclasses.field(default_factory=list)
+    frames: list[FrameOutcome] = dataclasses.field(default_factory=list)
     """Those that went through."""
     failures: list[tuple[str, str]] = dataclasses.field(default_factory=list)
     """Name and reason of those that did not."""
@@ -95,11 +112,10 @@ def describe_run(run: RunReport, compile_s: dict[int, float]) -> list[str]:
             f"detector: median {np.median(detect_ms):.0f} ms, slowest {detect_ms.max():.0f} ms a sweep; "
             f"reading, writing and drawing: median {np.median(other_ms):.0f} ms"
         )
-    statuses = [Status(int(frame.detections.status)) for frame in run.frames]
     for bit in Status:
-        count = sum(bit in status for status in statuses) if bit else 0
+        count = sum(bit in frame.status for frame in run.frames) if bit else 0
         if count:
-            lines.append(f"{bit.name} in {count} of {len(statuses)} sweeps")
+            lines.append(f"{bit.name} in {count} of {len(run.frames)} sweeps")
     lines.extend(f"failed: {name}: {reason}" for name, reason in run.failures)
     return lines
 

@@ -1,0 +1,200 @@
+"""How the time of a sweep goes with its points, with the batch, and with devices and processes.
+
+    python -m benchmarks.bench_scaling [--preset paper] [--quick] [--json FILE]
+
+Sweeps of 16,384 to 1,048,576 points are real ones: thinned out, or several turned about the sensor and laid
+over each other, which no scene is, so some capacities overflow (status). A batch is a loop over `detect`, a
+`detect_batch`, and a `jax.vmap`, whose bits are compared with the singles'. Throughput is measured in processes
+of their own: one that may use one core, one that may use all, two devices in one process, and `jaxbox.stream`
+over as many processes as there are cores.
+"""
+
+import argparse
+import concurrent.futures
+import functools
+import itertools
+import multiprocessing
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+import jaxbox
+from benchmarks import common
+from jaxbox import DetectorConfig, PointCloud
+from jaxbox.evaluation.copies import Copy, turn_points
+from jaxbox.io import Sweep
+from jaxbox.padding import CAPACITY_BUCKETS
+
+BATCHES, QUICK_BATCHES = (1, 2, 4, 8, 16, 32, 64), (1, 4)
+VMAPPED, QUICK_VMAPPED = (4, 64), (4,)
+"""Batches that are vmapped too: each compiles once more."""
+QUICK_CAPACITIES = (2**14, 2**17)
+RUNS, QUICK_RUNS = 20, 5
+STREAMED, QUICK_STREAMED = 160, 24
+"""Sweeps of a measurement of throughput."""
+TURN_DEG = 17.3
+"""Between sweeps that are laid over each other."""
+
+
+def resize(clouds: Sequence[np.ndarray], num_points: int) -> np.ndarray:
+    """(num_points, 3) of a sweep thinned out, or of several laid over each other."""
+    turned = (turn_points(xyz, Copy(TURN_DEG * i)) for i, xyz in enumerate(itertools.cycle(clouds)))
+    parts, count = [], 0
+    while count < num_points:
+        parts.append(next(turned))
+        count += len(parts[-1])
+    together = np.concatenate(parts)
+    return together[np.linspace(0, len(together) - 1, num_points).astype(int)]
+
+
+def time_sizes(
+    clouds: Sequence[np.ndarray], capacities: Sequence[int], config: DetectorConfig, runs: int
+) -> list[dict[str, Any]]:
+    """Time of a sweep that fills its capacity, for each capacity."""
+    rows = []
+    for capacity in capacities:
+        cloud = jax.device_put(PointCloud.from_numpy(resize(clouds, capacity), capacity=capacity))
+        run = functools.partial(jaxbox.detect, cloud, config)
+        compile_ms, found = common.milliseconds(run)
+        spent = [common.milliseconds(run)[0] for _ in range(runs)]
+        rows.append(
+            {
+                "points": capacity,
+                "first_call_s": compile_ms / 1e3,
+                **common.spread(spent),
+                "ns_per_point": 1e6 * float(np.median(spent)) / capacity,
+                "status": common.status_names([int(found.status)]),
+            }
+        )
+    return rows
+
+
+def same_bits(batch: Any, singles: Sequence[Any]) -> bool:
+    """Whether row i of every array of a batch has the bits of single i."""
+    return all(
+        np.array_equal(leaf[i], single_leaf)
+        for i, single in enumerate(singles)
+        for leaf, single_leaf in zip(jax.tree.leaves(batch), jax.tree.leaves(single), strict=True)
+    )
+
+
+def time_batches(
+    clouds: Sequence[PointCloud], config: DetectorConfig, *, quick: bool
+) -> list[dict[str, Any]]:
+    """Milliseconds a sweep of a loop, of `detect_batch` and of `jax.vmap`, by the size of the batch."""
+    rows = []
+    for size in QUICK_BATCHES if quick else BATCHES:
+        batch = list(itertools.islice(itertools.cycle(clouds), size))
+        ways: dict[str, Callable[[], Any]] = {
+            "loop": lambda batch=batch: [jax.block_until_ready(jaxbox.detect(c, config)) for c in batch],
+            "detect_batch": lambda batch=batch: jaxbox.detect_batch(batch, config),
+        }
+        if size in (QUICK_VMAPPED if quick else VMAPPED):
+            vmapped = jax.jit(jax.vmap(lambda cloud: jaxbox.detect(cloud, config)))
+            ways["vmap"] = functools.partial(vmapped, jaxbox.stack_clouds(batch))
+        answers = {name: jax.device_get(jax.block_until_ready(way())) for name, way in ways.items()}
+        spent: dict[str, list[float]] = {name: [] for name in ways}
+        for _ in range(2 if quick else 5):
+            for name, way in ways.items():
+                spent[name].append(common.milliseconds(way)[0] / size)
+        row: dict[str, Any] = {"batch": size} | {name: float(np.median(ms)) for name, ms in spent.items()}
+        if "vmap" in answers:
+            row["vmap_same_bits"] = same_bits(answers["vmap"], answers["loop"])
+        rows.append(row)
+    return rows
+
+
+def repeated(sweeps: Sequence[Sweep], count: int) -> Iterator[Sweep]:
+    return itertools.islice(itertools.cycle(sweeps), count)
+
+
+def rate_in_process(sweeps: Sequence[Sweep], preset: str, count: int, cores: int, devices: int) -> float:
+    """Sweeps a second of `detect_batch` in this process, which becomes one of so many cores and devices."""
+    if cores:
+        os.sched_setaffinity(0, set(itertools.islice(sorted(os.sched_getaffinity(0)), cores)))
+    common.enable_cache()
+    if devices > 1:
+        jax.config.update("jax_num_cpu_devices", devices)
+    config = DetectorConfig.presets()[preset]
+    clouds = [PointCloud.from_numpy(*sweep.read_points()) for sweep in sweeps]
+    placed = [jax.device_put(c, device) for c, device in zip(clouds, itertools.cycle(jax.local_devices()))]
+    jax.block_until_ready(jaxbox.detect_batch(placed, config))
+    batch = list(itertools.islice(itertools.cycle(placed), count))
+    start = time.perf_counter()
+    jax.block_until_ready(jaxbox.detect_batch(batch, config))
+    return count / (time.perf_counter() - start)
+
+
+def rate_of_stream(sweeps: Sequence[Sweep], preset: str, count: int, workers: int) -> float:
+    """Sweeps a second of `jaxbox.stream`, from files to boxes, once all workers are at work."""
+    start_up = 4 * workers
+    results = jaxbox.stream(
+        repeated(sweeps, start_up + count), DetectorConfig.presets()[preset], workers=workers
+    )
+    for _ in range(start_up):
+        next(results)
+    start = time.perf_counter()
+    errors = [result.error for result in results if result.error]
+    if errors:
+        raise SystemExit("\n".join(errors))
+    return count / (time.perf_counter() - start)
+
+
+def throughput(sweeps: Sequence[Sweep], preset: str, count: int) -> dict[str, float]:
+    """Sweeps a second, by what works at them."""
+    cores = len(os.sched_getaffinity(0))
+    ways: dict[str, tuple[Callable[..., float], tuple[int, ...]]] = {
+        "one process, one core": (rate_in_process, (1, 1)),
+        "one process, all cores": (rate_in_process, (0, 1)),
+        f"one process, {cores} devices": (rate_in_process, (0, cores)),
+        "stream, one worker": (rate_of_stream, (1,)),
+        f"stream, {cores} workers": (rate_of_stream, (cores,)),
+    }
+    rates = {}
+    for name, (function, arguments) in ways.items():
+        # A process each: cores and devices cannot be changed once JAX runs.
+        spawn = multiprocessing.get_context("spawn")
+        with concurrent.futures.ProcessPoolExecutor(1, spawn) as pool:
+            rates[name] = pool.submit(_call, function, (sweeps, preset, count, *arguments)).result()
+    return rates
+
+
+def _call(function: Callable[..., float], arguments: tuple[Any, ...]) -> float:
+    common.enable_cache()
+    return function(*arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Prints the tables and writes the report."""
+    parser = common.parser(__doc__ or "", quick="few sizes, batches and sweeps")
+    options: argparse.Namespace = parser.parse_args(arguments)
+    if options.set:
+        raise SystemExit("--set: scaling is measured with a preset as it is.")
+    config, quick = common.chosen_config(options), options.quick
+    sweeps = common.kitti_sweeps(8)
+    points = [sweep.read_points()[0] for sweep in sweeps]
+    rates = throughput(sweeps, options.preset, QUICK_STREAMED if quick else STREAMED)
+    sizes = time_sizes(
+        points, QUICK_CAPACITIES if quick else CAPACITY_BUCKETS, config, QUICK_RUNS if quick else RUNS
+    )
+    batches = time_batches([PointCloud.from_numpy(xyz) for xyz in points], config, quick=quick)
+
+    columns = ("points", "median", "p90", "ns_per_point", "first_call_s")
+    header = ["points", "median ms", "p90 ms", "ns a point", "first call s", "status"]
+    common.print_table(header, [[*(r[c] for c in columns), ", ".join(r["status"])] for r in sizes])
+    print("\nms a sweep, 131,072 points")
+    names = ("loop", "detect_batch", "vmap", "vmap_same_bits")
+    common.print_table(["batch", *names], [[r["batch"], *(r.get(n) for n in names)] for r in batches])
+    print()
+    base = rates["one process, one core"]
+    rows = [(name, rate, rate / base) for name, rate in rates.items()]
+    common.print_table(["", "sweeps a second", "times one core"], rows)
+    common.write_report({"sizes": sizes, "batches": batches, "sweeps_per_s": rates}, options)
+
+
+if __name__ == "__main__":
+    main()

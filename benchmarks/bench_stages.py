@@ -1,0 +1,182 @@
+"""Times detect() on real sweeps, whole and step by step, beside what the machine could do at the best.
+
+    python -m benchmarks.bench_stages [--preset paper] [--quick] [--json FILE]
+
+Compile time is apart. The whole is timed from a host array to boxes on the host, and on the device alone;
+each pass goes over different sweeps. A step is timed as a compiled function of its own, so the steps need
+not add up to the whole. Its floor is the longer of two times: its inputs and outputs through the memory
+once, and the arithmetic that the compiler counts (loops once) at the machine's best rate; both rates are
+measured in the same run. On an accelerator the same command measures that.
+"""
+
+import argparse
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxbox
+from benchmarks import common
+from jaxbox import DetectorConfig, PointCloud, detector, steps
+from jaxbox.io import Sweep
+
+MIN_SWEEPS, QUICK_SWEEPS = 80, 20
+"""Different sweeps that a 99th percentile is taken over, at the least."""
+
+STEP_SWEEPS, QUICK_STEP_SWEEPS = 30, 10
+"""Sweeps that each step is timed on."""
+
+PASSES, QUICK_PASSES = 3, 2
+"""Times that each sweep is run."""
+
+COPY_FLOATS, MATRIX = 2**25, 1024
+"""Sizes of the copy and of the product that measure the machine."""
+
+STEPS = (
+    "select_points", "remove_ground", "gather_obstacles", "propose_clusters", "fit_rectangles",
+    "build_evidence", "complete_boxes", "score_boxes", "conclude",
+)  # fmt: skip
+
+
+def time_whole(
+    points: Sequence[tuple[np.ndarray, np.ndarray]], config: DetectorConfig, passes: int
+) -> dict[str, Any]:
+    """Whole sweeps through detect(): from the host to the host, and on the device."""
+    clouds = [PointCloud.from_numpy(*p) for p in points]
+    first_call_ms, _ = common.milliseconds(lambda: jaxbox.detect(clouds[0], config))
+    on_host, on_device, statuses = [], [], []
+
+    def boxes(sweep: tuple[np.ndarray, np.ndarray]) -> Any:
+        found = jaxbox.detect(PointCloud.from_numpy(*sweep), config)
+        return jax.device_get((found.center, found.size, found.yaw, found.score, found.label, found.valid))
+
+    for _ in range(passes):
+        for sweep, cloud in zip(points, clouds, strict=True):
+            on_host.append(common.milliseconds(functools.partial(boxes, sweep))[0])
+            spent_ms, found = common.milliseconds(functools.partial(jaxbox.detect, cloud, config))
+            on_device.append(spent_ms)
+            statuses.append(int(found.status))
+    return {
+        "first_call_ms": first_call_ms,
+        "host to host": common.spread(on_host),
+        "on the device": common.spread(on_device),
+        "status": common.status_names(statuses),
+    }
+
+
+def machine_rates() -> dict[str, float]:
+    """Bytes and floating-point operations a second that this machine reaches."""
+    source = jnp.zeros(COPY_FLOATS)
+    matrix = jnp.ones((MATRIX, MATRIX))
+    best_ms = {}
+    for name, function, operand in (
+        ("copy", jax.jit(lambda a: a + 1), source),
+        ("product", jax.jit(lambda a: a @ a), matrix),
+    ):
+        jax.block_until_ready(function(operand))
+        best_ms[name] = min(common.milliseconds(functools.partial(function, operand))[0] for _ in range(5))
+    return {
+        "bytes_per_s": 2 * source.nbytes / best_ms["copy"] * 1e3,
+        "flops_per_s": 2 * MATRIX**3 / best_ms["product"] * 1e3,
+    }
+
+
+def floor(compiled: Any, rates: dict[str, float]) -> dict[str, float]:
+    """Least time of a compiled function: its inputs and outputs, and its arithmetic, at the best rates."""
+    memory, cost = compiled.memory_analysis(), compiled.cost_analysis() or {}
+    moved = memory.argument_size_in_bytes + memory.output_size_in_bytes
+    flops = max(float(cost.get("flops", 0)), 0.0)
+    return {
+        "bytes": moved,
+        "flops": flops,
+        "floor_ms": 1e3 * max(moved / rates["bytes_per_s"], flops / rates["flops_per_s"]),
+    }
+
+
+def time_steps(
+    clouds: Sequence[PointCloud], config: DetectorConfig, rates: dict[str, float]
+) -> dict[str, dict[str, float]]:
+    """Each step of detect() by itself, on what the steps before it found."""
+    compiled: dict[str, Callable[..., Any]] = {}
+    floors: dict[str, dict[str, float]] = {}
+    spent: dict[str, list[float]] = {name: [] for name in STEPS}
+
+    def run(name: str, *inputs: Any) -> Any:
+        if name not in compiled:
+            compiled[name] = jax.jit(getattr(steps, name)).lower(*inputs).compile()
+            floors[name] = floor(compiled[name], rates)
+        jax.block_until_ready(compiled[name](*inputs))
+        ms, result = common.milliseconds(functools.partial(compiled[name], *inputs))
+        spent[name].append(ms)
+        return result
+
+    for cloud in clouds:
+        sweep = run("select_points", cloud, config)
+        heights = run("remove_ground", sweep, config, jax.random.key(0))
+        obstacles = run("gather_obstacles", sweep, heights, config)
+        proposals = run("propose_clusters", obstacles, config)
+        fits = run("fit_rectangles", obstacles, proposals, config)
+        seen = run("build_evidence", sweep, heights, config)
+        trials, boxes = run("complete_boxes", fits, proposals, seen, config)
+        candidates = run("score_boxes", trials, boxes, proposals, obstacles, heights, seen, config)
+        run("conclude", cloud, sweep, heights, obstacles, proposals, fits, candidates, config)
+    return {name: common.spread(spent[name]) | floors[name] for name in STEPS}
+
+
+def whole_program(cloud: PointCloud, config: DetectorConfig, rates: dict[str, float]) -> dict[str, float]:
+    """Floor and memory of the whole compiled detector."""
+    compiled = detector.lower(cloud, config).compile()
+    memory: Any = compiled.memory_analysis()
+    return floor(compiled, rates) | {
+        "arguments_mb": memory.argument_size_in_bytes / 1e6,
+        "outputs_mb": memory.output_size_in_bytes / 1e6,
+        "scratch_mb": memory.temp_size_in_bytes / 1e6,
+        "code_mb": memory.generated_code_size_in_bytes / 1e6,
+    }
+
+
+def read_all(sweeps: Sequence[Sweep]) -> list[tuple[np.ndarray, np.ndarray]]:
+    return [sweep.read_points() for sweep in sweeps]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Prints the tables and writes the report."""
+    parser = common.parser(__doc__ or "", quick="fewer sweeps and passes")
+    options: argparse.Namespace = parser.parse_args(arguments)
+    config = jax.tree.map(float, common.chosen_config(options))
+    points = read_all(common.kitti_sweeps(QUICK_SWEEPS if options.quick else None))
+    if not options.quick and len(points) < MIN_SWEEPS:
+        print(f"only {len(points)} sweeps are at hand; a 99th percentile wants {MIN_SWEEPS}")
+    rates = machine_rates()
+    whole = time_whole(points, config, QUICK_PASSES if options.quick else PASSES)
+    some = points[:: max(len(points) // (QUICK_STEP_SWEEPS if options.quick else STEP_SWEEPS), 1)]
+    clouds = [jax.device_put(PointCloud.from_numpy(*p)) for p in some]
+    by_step = time_steps(clouds, config, rates)
+    program = whole_program(PointCloud.from_numpy(*points[0]), config, rates)
+
+    columns = ("min", "median", "p90", "p99", "runs", "floor_ms")
+    rows = [
+        ("host to host", *whole["host to host"].values(), None),
+        ("on the device", *whole["on the device"].values(), program["floor_ms"]),
+        *((f"  {name}", *(values[c] for c in columns)) for name, values in by_step.items()),
+    ]
+    common.print_table(["", "min ms", "median ms", "p90 ms", "p99 ms", "runs", "floor ms"], rows)
+    host = whole["host to host"]
+    print(f"\n{len(points)} sweeps of {np.median([len(p[0]) for p in points]):.0f} points, {options.preset}")
+    print(f"p99 is {host['p99'] / host['median']:.2f} times the median")
+    print(f"first call, with its compile or from the cache: {whole['first_call_ms'] / 1e3:.1f} s")
+    print(
+        f"memory: arguments {program['arguments_mb']:.1f}, outputs {program['outputs_mb']:.1f}, "
+        f"scratch {program['scratch_mb']:.1f} MB"
+    )
+    print(f"machine: {rates['bytes_per_s'] / 1e9:.1f} GB/s, {rates['flops_per_s'] / 1e9:.0f} GFLOP/s")
+    print(f"status {whole['status'] or 'OK'}")
+    report = {"whole": whole, "steps": by_step, "program": program, "machine_rates": rates}
+    common.write_report(report | {"num_sweeps": len(points)}, options)
+
+
+if __name__ == "__main__":
+    main()

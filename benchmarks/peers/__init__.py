@@ -1,0 +1,1 @@
+"""Other programs' chains on the same sweeps, for `benchmarks.bench_peers`."""
