@@ -4,9 +4,9 @@
 
 Sweeps of 16,384 to 1,048,576 points are real ones: thinned out, or several turned about the sensor and laid
 over each other, which no scene is, so some capacities overflow (status). A batch is a loop over `detect`, a
-`detect_batch`, and a `jax.vmap`, whose bits are compared with the singles'. Throughput is measured in processes
-of their own: one that may use one core, one that may use all, two devices in one process, and `jaxbox.stream`
-over as many processes as there are cores.
+`detect_batch`, and a `jax.vmap`, whose bits are compared with the singles'. Throughput is measured in
+processes of their own: one that may use one core, one that may use all, two devices in one process, and
+`jaxbox.stream` over as many processes as there are cores.
 """
 
 import argparse

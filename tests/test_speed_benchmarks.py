@@ -1,0 +1,101 @@
+"""The benchmarks of time and memory: what they count, and when the guard of CI bites."""
+
+import importlib
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+CAR = [10.0, 2.0, 4.0, 1.8, 0.3]
+
+
+@pytest.fixture
+def benchmark(monkeypatch):
+    """Imports a benchmark by its name."""
+    monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parents[1]))
+    return lambda name: importlib.import_module(f"benchmarks.{name}")
+
+
+def points_on(box, height=1.5, count=400):
+    """(count, 3) points on two sides of a box, as a sensor sees them."""
+    rng = np.random.default_rng(0)
+    x, y, length, width, yaw = box
+    along, side = rng.uniform(-0.5, 0.5, count), np.arange(count) % 2 == 0
+    local = np.where(side[:, None], [[1, 0]], [[0, 1]]) * along[:, None] + np.where(
+        side[:, None], [[0, -0.5]], [[-0.5, 0]]
+    )
+    local = local * [length, width]
+    turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    return np.column_stack([local @ turn + [x, y], rng.uniform(0, height, count)])
+
+
+def test_a_car_is_found_by_a_box_that_covers_it_well(benchmark):
+    peers = benchmark("bench_peers")
+    half_off = [CAR[0] + 2 * np.cos(0.3), CAR[1] + 2 * np.sin(0.3), *CAR[2:]]
+    assert peers.overlap(np.array(CAR), np.array(CAR)) == pytest.approx(1, abs=1e-3)
+    assert peers.overlap(np.array(CAR), np.array(half_off)) == pytest.approx(1 / 3, abs=1e-3)
+    assert peers.overlap(np.array(CAR), np.array([-9.0, *CAR[1:]])) == 0
+    cars = np.array([CAR, [-20.0, *CAR[1:]]])
+    assert peers.count_found(cars, np.array([half_off, CAR])) == 1
+    assert peers.count_found(cars, np.zeros((0, 5))) == 0
+
+
+def test_the_chains_rectangle_is_that_of_the_sides_and_the_gate_lets_vehicles_pass(benchmark):
+    chains = benchmark("peers.chains")
+    row = chains.fit_rectangle(points_on(CAR))
+    assert row[:4] == pytest.approx(CAR[:4], abs=0.05)
+    assert np.sin(2 * (row[4] - CAR[4])) == pytest.approx(0, abs=0.05)
+    wall = [0, 0, 30.0, 0.5, 0, 2.0, 0]
+    assert chains.gate_sizes(np.array([row, wall])).shape == (1, 5)
+    assert chains.gate_sizes(np.zeros(0)).shape == (0, 5)
+
+
+def test_clusters_become_boxes_and_those_with_few_points_do_not(benchmark):
+    chains = benchmark("peers.chains")
+    xyz = np.concatenate([points_on(CAR), points_on([30.0, *CAR[1:]]), [[0, 0, 0]] * 5])
+    cluster = np.repeat([4, 1, 2, -1], [400, 400, 3, 2])
+    answer = chains.box_clusters(xyz, cluster)
+    assert (answer.kept, answer.clusters, len(answer.boxes)) == (805, 2, 2)
+    np.testing.assert_array_equal(
+        chains.voxel_clusters(xyz[:400], lambda p: np.arange(len(p)) * 0 + 7), np.full(400, 7)
+    )
+
+
+def test_a_missing_peer_is_named_with_the_command_that_installs_it(benchmark, monkeypatch):
+    chains = benchmark("peers.chains")
+
+    def absent():
+        raise chains.MissingPeer("pip install it")
+
+    monkeypatch.setattr(chains, "PEERS", {"there": lambda: len, "absent": absent})
+    assert chains.make_peers(["there", "absent"]) == ({"there": len}, {"absent": "pip install it"})
+
+
+def test_the_guard_bites_below_its_share_of_the_recorded_ratio(benchmark, tmp_path):
+    peers = benchmark("bench_peers")
+    file = tmp_path / "guard.json"
+    file.write_text(json.dumps({"times_faster_than_reference": {"jaxbox default": 100.0, "other": 1.0}}))
+    limit = 100 * peers.GUARD_SHARE
+    assert peers.check_guard({"jaxbox default": limit + 1}, file) == []
+    (failure,) = peers.check_guard({"jaxbox default": limit - 1}, file)
+    assert failure.startswith("jaxbox default: ")
+    assert peers.ratios({"reference": {"median": 9.0}, "jaxbox paper": {"median": 3.0}}) == {
+        "jaxbox paper": 3.0
+    }
+
+
+def test_sweeps_of_any_size_are_made_of_real_ones(benchmark):
+    scaling = benchmark("bench_scaling")
+    clouds = [np.full((10, 3), i, np.float32) for i in range(2)]
+    assert scaling.resize(clouds, 4).shape == (4, 3)
+    assert scaling.resize(clouds, 35).shape == (35, 3)
+
+
+def test_bits_of_a_batch_are_compared_with_each_single(benchmark):
+    scaling = benchmark("bench_scaling")
+    batch = {"a": np.array([[1.0, 2.0], [3.0, 4.0]])}
+    singles = [{"a": np.array([1.0, 2.0])}, {"a": np.array([3.0, 4.0])}]
+    assert scaling.same_bits(batch, singles)
+    singles[1]["a"][0] = np.nextafter(3.0, 4.0)
+    assert not scaling.same_bits(batch, singles)
