@@ -79,8 +79,8 @@ def test_bad_text_points_are_named_with_file_and_line(tmp_path, text, message):
 
 
 def test_unknown_suffix_missing_file_and_binary_text_are_refused(tmp_path):
-    with pytest.raises(io.InputError, match=r"a\.las: not a known kind of points; give one of \.bin"):
-        io.read_points(tmp_path / "a.las")
+    with pytest.raises(io.InputError, match=r"a\.e57: not a known kind of points; give one of \.bin"):
+        io.read_points(tmp_path / "a.e57")
     with pytest.raises(io.InputError, match=r"a\.bin: there is no such file"):
         io.read_points(tmp_path / "a.bin")
     (tmp_path / "a.txt").write_bytes(b"\xff\xfe1 2 3")

@@ -1,7 +1,12 @@
-"""Files in and out: KITTI's formats and folder layouts, other data sets, plain points, images, JSON Lines."""
+"""Files in and out: points and recordings of every kind, data sets' layouts, labels, images, and results."""
 
 from jaxbox.io._files import InputError, atomic_path, atomic_writer
-from jaxbox.io.argoverse2 import read_argoverse2_boxes, read_argoverse2_ground, read_argoverse2_points
+from jaxbox.io.argoverse2 import (
+    read_argoverse2_boxes,
+    read_argoverse2_ground,
+    read_argoverse2_points,
+    read_feather,
+)
 from jaxbox.io.drives import read_drives
 from jaxbox.io.images import read_image
 from jaxbox.io.jsonl import detections_record, read_jsonl, write_jsonl
@@ -16,15 +21,26 @@ from jaxbox.io.kitti import (
 )
 from jaxbox.io.kitti_calibration import read_calibration, read_raw_calibration, write_calibration
 from jaxbox.io.labelled import LabelledBoxes
+from jaxbox.io.las import read_las
+from jaxbox.io.npy import read_npy, read_npz
+from jaxbox.io.nuscenes import read_nuscenes
 from jaxbox.io.pandaset import read_pandaset_boxes, read_pandaset_points
-from jaxbox.io.points import read_bin, read_points, read_text_points, write_bin
+from jaxbox.io.pcd import read_pcd
+from jaxbox.io.ply import read_ply
+from jaxbox.io.points import read_bin, read_text_points, write_bin
+from jaxbox.io.recordings import RecordedSweeps
+from jaxbox.io.registry import POINT_SUFFIXES, read_points
 from jaxbox.io.semantic_kitti import read_semantic_labels
-from jaxbox.io.sweeps import Sweep, open_sweeps
+from jaxbox.io.sweep import Sweep
+from jaxbox.io.sweeps import RECORDING_SUFFIXES, open_sweeps
 
 __all__ = [
+    "POINT_SUFFIXES",
+    "RECORDING_SUFFIXES",
     "InputError",
     "KittiObject",
     "LabelledBoxes",
+    "RecordedSweeps",
     "Sweep",
     "atomic_path",
     "atomic_writer",
@@ -39,12 +55,19 @@ __all__ = [
     "read_bin",
     "read_calibration",
     "read_drives",
+    "read_feather",
     "read_image",
     "read_jsonl",
     "read_label_folder",
     "read_labels",
+    "read_las",
+    "read_npy",
+    "read_npz",
+    "read_nuscenes",
     "read_pandaset_boxes",
     "read_pandaset_points",
+    "read_pcd",
+    "read_ply",
     "read_points",
     "read_raw_calibration",
     "read_semantic_labels",

@@ -1,8 +1,8 @@
 """Argoverse 2 sensor data: sweeps, annotated boxes and ground flags.
 
-The data set's Feather tables are read after they have been written out plainly: the sweep's x, y, z and
-intensity as KITTI's binary points, the annotations as a JSON list of records with the table's own column
-names, the ground flags as one byte a point.
+Sweeps are read as the data set has them, Feather tables named by their time, and as they come from plain
+copies: x, y, z and intensity as KITTI's binary points. Annotations are a JSON list of records with the
+table's own column names, ground flags one byte a point.
 
 All of them are in the vehicle's frame, whose origin is the middle of the rear axle. What a beam passed
 through on its way can only be told from the sensor, so everything is moved to the upper LiDAR's frame.
@@ -13,13 +13,15 @@ forecasting", NeurIPS Datasets and Benchmarks 2021.
 
 import json
 import os
+import pathlib
 from typing import Any
 
 import numpy as np
 
+from jaxbox.io._extras import require
 from jaxbox.io._files import InputError, read_bytes, read_text
 from jaxbox.io.labelled import LabelledBoxes, check_count, finite_number, labelled_boxes
-from jaxbox.io.points import read_bin
+from jaxbox.io.points import PointFormat, Points, check_num_points, named_points, read_bin
 
 SENSOR_XYZ_M = (1.35, 0.0, 1.64)
 """The upper LiDAR in the vehicle's frame; cars of the fleet differ by centimetres."""
@@ -57,6 +59,63 @@ def read_argoverse2_points(
     """
     xyz, intensity = read_bin(path)
     return xyz - np.asarray(sensor_xyz_m, np.float32), intensity
+
+
+def read_feather(path: str | os.PathLike[str]) -> Points:
+    """Reads a sweep of the data set as it comes, ``sensors/lidar/*.feather``, and moves it to the sensor.
+
+    The upper LiDAR's place is taken from the log's ``calibration/egovehicle_SE3_sensor.feather``, or is
+    `SENSOR_XYZ_M` where there is none.
+
+    Args:
+      path: a Feather table with x, y and z in the vehicle's frame.
+
+    Returns:
+      As `jaxbox.io.read_points`.
+
+    Raises:
+      InputError: where it is no such table.
+      ImportError: without the extra ``arrow``.
+    """
+    xyz, intensity = named_points(_read_table(path, ("x", "y", "z", "intensity")), str(path))
+    calibration = pathlib.Path(os.path.abspath(path)).parents[2:3]
+    file = calibration[0] / "calibration" / "egovehicle_SE3_sensor.feather" if calibration else None
+    sensor = _sensor_xyz_m(file) if file is not None and file.is_file() else SENSOR_XYZ_M
+    return xyz - np.asarray(sensor, np.float32), intensity
+
+
+def _sensor_xyz_m(path: pathlib.Path) -> np.ndarray:
+    table = _read_table(path, ("sensor_name", *_CENTER))
+    rows = [i for i, name in enumerate(table.get("sensor_name", [])) if name == "up_lidar"]
+    if not rows or any(name not in table for name in _CENTER):
+        raise InputError(f"{path}: no row up_lidar with tx_m, ty_m, tz_m; restore the file, or remove it.")
+    return np.array([table[name][rows[0]] for name in _CENTER], float)
+
+
+def _read_table(path: str | os.PathLike[str], columns: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Those of the columns that a Feather table has."""
+    feather = require("pyarrow.feather", extra="arrow", what="Feather files")
+    arrow = require("pyarrow", extra="arrow", what="Feather files")
+    try:
+        with arrow.memory_map(str(path)) as source, arrow.ipc.open_file(source) as reader:
+            there = reader.schema.names
+            batches = [reader.get_batch(i).num_rows for i in range(reader.num_record_batches)]
+        check_num_points(sum(batches), str(path))
+        table = feather.read_table(path, columns=[name for name in columns if name in there])
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: there is no such file; check the path.") from error
+    except (arrow.ArrowException, OSError) as error:
+        raise InputError(f"{path}: no readable Feather table ({error}); copy it again.") from error
+    return {name: table[name].to_numpy() for name in table.column_names}
+
+
+def feather_timestamp_ns(path: pathlib.Path) -> int | None:
+    """The time in a file's name.
+
+    >>> feather_timestamp_ns(pathlib.Path("315966265259836000.feather"))
+    315966265259836000
+    """
+    return int(path.stem) if path.stem.isdecimal() else None
 
 
 def read_argoverse2_boxes(
@@ -136,3 +195,8 @@ def _rotation(entry: Any, where: str) -> np.ndarray:
     if norm < _MIN_NORM:
         raise InputError(f"{where}: qw, qx, qy, qz are {rotation.tolist()}; a rotation has length 1.")
     return rotation / norm
+
+
+FEATHER = PointFormat(
+    name="Argoverse 2", suffixes=(".feather",), read=read_feather, timestamp_ns=feather_timestamp_ns
+)

@@ -1,7 +1,9 @@
-"""Sweeps as plain files: KITTI's binary points, and points as text."""
+"""Points as the formats share them, and the two formats without a library: KITTI's binary, and text."""
 
+import dataclasses
 import os
 import pathlib
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
@@ -10,33 +12,97 @@ from jaxbox.io._files import InputError, atomic_path, read_bytes, read_text
 _VALUES_PER_POINT = 4
 _BYTES_PER_POINT = _VALUES_PER_POINT * np.dtype("<f4").itemsize
 
-TEXT_SUFFIXES = (".txt", ".csv", ".xyz")
-"""Suffixes that are read as text points."""
+Points = tuple[np.ndarray, np.ndarray]
+"""xyz (n, 3) float32, m, and intensity (n,) float32."""
 
-POINT_SUFFIXES = (".bin", *TEXT_SUFFIXES)
-"""Suffixes that `read_points` knows, in the order in which a folder is searched for them."""
+MAX_POINTS = 2**27
+"""No sensor makes more in a sweep; a file that claims so is broken, and is refused before it is read."""
+
+INTENSITY_NAMES = ("intensity", "reflectivity", "reflectance", "remission", "scalar_intensity", "i")
+"""Names that the formats give to the strength of a return; the first that is there is taken."""
 
 
-def read_points(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Reads one sweep, in the format that its suffix says.
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PointFormat:
+    """A kind of file that holds one sweep."""
+
+    name: str
+    """In words, for the documentation and errors."""
+    suffixes: tuple[str, ...]
+    """Lower-case ends of its file names."""
+    read: Callable[[pathlib.Path], Points]
+    """Reads a file, as `jaxbox.io.read_points`."""
+    timestamp_ns: Callable[[pathlib.Path], int | None] = lambda _: None
+    """When the sweep of a file was taken, ns since 1970, as far as the file's name says; None where it
+    does not."""
+
+
+def named_points(columns: Mapping[str, np.ndarray], where: str) -> Points:
+    """Picks coordinates and intensity out of named columns.
 
     Args:
-      path: a ``.bin`` file, or a ``.txt``, ``.csv`` or ``.xyz`` file of text points.
+      columns: n values each; names in any case.
+      where: the file, for the error.
 
     Returns:
-      xyz: (n, 3) float32, m, sensor frame; NaN and infinity are kept for the detector to count.
-      intensity: (n,) float32, the file's own unit; 0 where the file has none.
+      As `jaxbox.io.read_points`.
 
     Raises:
-      InputError: for another suffix, or as `read_bin` and `read_text_points`.
+      InputError: where x, y or z is missing or is no number.
     """
-    suffix = pathlib.Path(path).suffix.lower()
-    if suffix not in POINT_SUFFIXES:
-        raise InputError(f"{path}: not a known kind of points; give one of {', '.join(POINT_SUFFIXES)}.")
-    return read_bin(path) if suffix == ".bin" else read_text_points(path)
+    known = {name.lower(): values for name, values in columns.items()}
+    if missing := [name for name in "xyz" if name not in known]:
+        raise InputError(
+            f"{where}: no field {' or '.join(missing)} among {', '.join(columns) or 'none'}; "
+            "points need x, y and z. Rename the fields, or convert the file."
+        )
+    if wrong := [name for name in "xyz" if known[name].dtype.kind not in "fiu" or known[name].ndim != 1]:
+        raise InputError(f"{where}: field {wrong[0]} is not one real number a point.")
+    intensity = next((known[name] for name in INTENSITY_NAMES if name in known), None)
+    # A number beyond float32's range becomes infinite, and is counted by the detector.
+    with np.errstate(over="ignore"):
+        xyz = np.stack([known[name].astype(np.float32) for name in "xyz"], axis=1)
+        if intensity is None or intensity.dtype.kind not in "fiu" or intensity.ndim != 1:
+            return xyz, np.zeros(len(xyz), np.float32)
+        return xyz, intensity.astype(np.float32)
 
 
-def read_bin(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
+def check_num_points(claimed: int, where: str) -> None:
+    """Refuses what cannot be the size of a sweep, before memory is asked for.
+
+    Args:
+      claimed: number of points that a header claims.
+      where: the file, for the error.
+
+    Raises:
+      InputError: for a negative number, or more than `MAX_POINTS`.
+    """
+    if not 0 <= claimed <= MAX_POINTS:
+        raise InputError(
+            f"{where}: the header claims {claimed} points; a sweep has at most {MAX_POINTS}. "
+            "The file is damaged: copy or convert it again."
+        )
+
+
+def check_num_bytes(needed: int, there: int, where: str) -> None:
+    """Refuses a body that is shorter than its header says.
+
+    Args:
+      needed: bytes that the header's points take.
+      there: bytes that follow the header.
+      where: the file, for the error.
+
+    Raises:
+      InputError: where some are missing.
+    """
+    if there < needed:
+        raise InputError(
+            f"{where}: {there} bytes of points, and the header promises {needed}. "
+            "The file was cut short: copy it again."
+        )
+
+
+def read_bin(path: str | os.PathLike[str]) -> Points:
     """Reads KITTI's binary points: little-endian float32 x, y, z, intensity, and no header.
 
     Args:
@@ -49,14 +115,33 @@ def read_bin(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
     Raises:
       InputError: where the file is missing, or its size is no multiple of 16 bytes.
     """
-    data = read_bytes(path)
-    if len(data) % _BYTES_PER_POINT:
-        raise InputError(
-            f"{path}: {len(data)} bytes is no multiple of {_BYTES_PER_POINT} (float32 x, y, z, intensity). "
-            "Copy the file again if it was cut short, or convert it to four columns."
-        )
-    points = np.frombuffer(data, "<f4").astype(np.float32).reshape(-1, _VALUES_PER_POINT)
+    points = read_float_rows(path, _VALUES_PER_POINT, "x, y, z, intensity")
     return points[:, :3].copy(), points[:, 3].copy()
+
+
+def read_float_rows(path: str | os.PathLike[str], columns: int, names: str) -> np.ndarray:
+    """Reads rows of little-endian float32 without a header.
+
+    Args:
+      path: the file; an empty one has no rows.
+      columns: values a row.
+      names: of the columns, for the error.
+
+    Returns:
+      (n, columns) float32.
+
+    Raises:
+      InputError: where the file is missing, or its size is no whole number of rows.
+    """
+    data = read_bytes(path)
+    row = columns * np.dtype("<f4").itemsize
+    if len(data) % row:
+        raise InputError(
+            f"{path}: {len(data)} bytes is no multiple of {row} (float32 {names}). "
+            f"Copy the file again if it was cut short, or convert it to {columns} columns; five columns, as "
+            "of nuScenes, are read from names that end in .pcd.bin."
+        )
+    return np.frombuffer(data, "<f4").astype(np.float32).reshape(-1, columns)
 
 
 def write_bin(path: str | os.PathLike[str], xyz: np.ndarray, intensity: np.ndarray | None = None) -> None:
@@ -75,7 +160,7 @@ def write_bin(path: str | os.PathLike[str], xyz: np.ndarray, intensity: np.ndarr
         temporary.write_bytes(points.tobytes())
 
 
-def read_text_points(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
+def read_text_points(path: str | os.PathLike[str]) -> Points:
     """Reads text points: ``x y z [intensity]`` a line, between them blanks or commas.
 
     Empty lines and lines that begin with ``#`` are skipped, and so is a first line of column names.
@@ -121,3 +206,7 @@ def _parse_point(words: list[str], columns: int, where: str) -> list[float]:
     except ValueError as error:
         raise InputError(f"{where}: {' '.join(words)[:60]!r} is not x y z [intensity] in numbers.") from error
     return values if len(values) == _VALUES_PER_POINT else [*values, 0.0]
+
+
+BIN = PointFormat(name="KITTI binary", suffixes=(".bin",), read=read_bin)
+TEXT = PointFormat(name="text", suffixes=(".txt", ".csv", ".xyz"), read=read_text_points)

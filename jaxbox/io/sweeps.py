@@ -1,40 +1,54 @@
 """From a path to sweeps: which points, calibration, labels and image belong together.
 
-Three of KITTI's layouts are known, at the dataset's root or any folder below, and plain folders:
+Layouts are known at the dataset's root or any folder below:
 
-- object: ``training/{velodyne,calib,label_2,image_2}/000001.*``
-- tracking: ``training/velodyne/0000/000001.bin``, ``training/{calib,label_02}/0000.txt``,
+- KITTI object: ``training/{velodyne,calib,label_2,image_2}/000001.*``
+- KITTI tracking: ``training/velodyne/0000/000001.bin``, ``training/{calib,label_02}/0000.txt``,
   ``training/image_02/0000/000001.png``
-- raw: ``2011_09_26/2011_09_26_drive_0052_sync/{velodyne_points,image_02}/data/0000000001.*``, with the
-  calibration files beside the drive
-- plain: a folder of point files, or one, without anything else.
+- KITTI raw: ``2011_09_26/2011_09_26_drive_0052_sync/{velodyne_points,image_02}/data/0000000001.*``, with the
+  calibration files beside the drive, and the times in ``velodyne_points/timestamps.txt``
+- Argoverse 2: ``LOG/sensors/lidar/315966265259836000.feather``
+- nuScenes: ``samples/LIDAR_TOP/*.pcd.bin``
+- plain: a folder of point files, or one, without anything else; or recordings, which hold many sweeps.
 
 What belongs to a sweep follows from where its points lie, so it is the same however it was reached.
 """
 
+import bisect
+import collections
 import dataclasses
+import datetime
+import functools
+import glob
+import itertools
 import os
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import overload
 
-import numpy as np
+from jaxbox.io._files import InputError, read_text
+from jaxbox.io.kitti import tracking_name
+from jaxbox.io.kitti_calibration import RAW_CALIBRATION_FILES
+from jaxbox.io.mcap import MCAP
+from jaxbox.io.points import TEXT, PointFormat
+from jaxbox.io.recordings import RecordedSweeps, RecordingFormat
+from jaxbox.io.registry import POINT_FORMATS, POINT_SUFFIXES, format_of, suffix_of
+from jaxbox.io.rosbag import ROSBAG
+from jaxbox.io.sweep import Sweep
 
-from jaxbox.io._files import InputError
-from jaxbox.io.images import read_image
-from jaxbox.io.kitti import KittiObject, read_labels, tracking_name
-from jaxbox.io.kitti_calibration import (
-    IMAGE_SIZE_PX,
-    RAW_CALIBRATION_FILES,
-    read_calibration,
-    read_raw_calibration,
+RECORDING_FORMATS: tuple[RecordingFormat, ...] = (ROSBAG, MCAP)
+"""The recordings that `open_sweeps` knows."""
+
+RECORDING_SUFFIXES: tuple[str, ...] = tuple(
+    suffix for recording_format in RECORDING_FORMATS for suffix in recording_format.suffixes
 )
-from jaxbox.io.points import POINT_SUFFIXES, TEXT_SUFFIXES, read_points
-from jaxbox.types import Calibration
+"""Suffixes of their files."""
 
 _FOLDERS = (
     "velodyne", "velodyne/*", "*",
     "training/velodyne", "training/velodyne/*",
     "data", "velodyne_points/data", "*/velodyne_points/data", "*/*/velodyne_points/data",
+    "sensors/lidar", "*/sensors/lidar", "LIDAR_TOP", "samples/LIDAR_TOP",
 )  # fmt: skip
 """Where points may lie below a given folder, after the folder itself."""
 
@@ -42,111 +56,142 @@ _SEARCHED = tuple(folder for folder in _FOLDERS if folder != "*")
 
 _IMAGE_SUFFIXES = (".png", ".jpg")
 
-
-@dataclasses.dataclass(frozen=True)
-class Sweep:
-    """One LiDAR sweep and the files that belong to it; nothing is read before it is asked for."""
-
-    name: str
-    """Unique among the sweeps of a folder, fit for a file name: "000001", "0000_000001" (tracking) or
-    "2011_09_26_drive_0052_sync_0000000001" (raw)."""
-    points_path: pathlib.Path
-    """The points."""
-    calibration_path: pathlib.Path | None = None
-    """A ``calib/*.txt`` file, or for raw recordings the day's folder; None where there is none."""
-    labels_path: pathlib.Path | None = None
-    """The label file; None where there is none."""
-    image_path: pathlib.Path | None = None
-    """The left colour camera's image; None where there is none."""
-    frame: int | None = None
-    """Frame within the sequence, which picks this sweep's lines of a tracking label file."""
-
-    def read_points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Reads the points.
-
-        Returns:
-          xyz: (n, 3) float32, m, sensor frame.
-          intensity: (n,) float32, the file's own unit; 0 where unknown.
-
-        Raises:
-          InputError: naming the file, where it cannot be read.
-        """
-        return read_points(self.points_path)
-
-    def read_calibration(self) -> Calibration | None:
-        """Reads the calibration of the left colour camera.
-
-        Returns:
-          The camera, with the image's size; or the raw calibration's size, or 1242 x 375, where there
-          is no image. None where the sweep has no calibration.
-
-        Raises:
-          InputError: naming the file, where it or the image cannot be read.
-        """
-        if self.calibration_path is None:
-            return None
-        image = self.read_image()
-        size = None if image is None else (image.shape[1], image.shape[0])
-        if self.calibration_path.is_dir():
-            return read_raw_calibration(self.calibration_path, image_size_px=size)
-        return read_calibration(self.calibration_path, image_size_px=size or IMAGE_SIZE_PX)
-
-    def read_labels(self) -> list[KittiObject] | None:
-        """Reads the labels of this sweep.
-
-        Returns:
-          The objects, none of them for an empty frame; or None where the sweep has no labels.
-
-        Raises:
-          InputError: naming file and line, where it cannot be read.
-        """
-        return None if self.labels_path is None else read_labels(self.labels_path, frame=self.frame)
-
-    def read_image(self) -> np.ndarray | None:
-        """Reads the left colour camera's image.
-
-        Returns:
-          (height, width, 3) uint8, RGB; or None where the sweep has no image.
-
-        Raises:
-          InputError: naming the file, where it cannot be decoded.
-        """
-        return None if self.image_path is None else read_image(self.image_path)
+PathLike = str | os.PathLike[str]
 
 
-def open_sweeps(path: str | os.PathLike[str]) -> tuple[Sweep, ...]:
+def open_sweeps(path: PathLike | Sequence[PathLike], *, topic: str | None = None) -> Sequence[Sweep]:
     """Finds the sweeps at a path; see the module for the layouts.
 
+    Nothing but folders, and the index of recordings, is read before it is asked for; a pass over a
+    recording holds one message at a time.
+
     Args:
-      path: a point file, a folder of point files, or a KITTI folder.
+      path: a point file, a recording (ROS bag, MCAP), a folder of either, a KITTI, Argoverse 2 or nuScenes
+        folder, a pattern such as ``"drive/*.pcd"``, or several of them.
+      topic: of the points in recordings; None where each has only one.
 
     Returns:
-      At least one sweep, sorted by path; their names differ.
+      At least one sweep, files sorted by path, and recordings by time; their names differ.
 
     Raises:
-      InputError: where there is no such path, or no points in it.
+      InputError: where there is no such path, no points in it, or the topic has to be named.
+      ImportError: naming the extra that a recording needs, where that is not installed.
     """
+    paths = [path] if isinstance(path, str | os.PathLike) else list(path)
+    if not paths:
+        raise InputError("no path was given; name at least one file or folder.")
+    parts = [part for item in paths for found in _expand(item) for part in _open_path(found, topic)]
+    if all(isinstance(part, tuple) for part in parts):
+        return _distinct([sweep for part in parts for sweep in part])
+    return parts[0] if len(parts) == 1 else _Chain(parts)
+
+
+def _expand(path: PathLike) -> list[pathlib.Path]:
+    """The paths that a pattern matches, or the path itself."""
     # Not `resolve`: datasets are often put together from links, and the layout is in the links' names.
-    path = pathlib.Path(os.path.abspath(path))
+    text = os.path.abspath(path)
+    if os.path.exists(text) or not glob.has_magic(text):
+        return [pathlib.Path(text)]
+    if found := sorted(glob.glob(text, recursive=True)):
+        return [pathlib.Path(item) for item in found]
+    raise InputError(f"{path}: no file or folder is of this pattern; check it.")
+
+
+def _open_path(path: pathlib.Path, topic: str | None) -> list[Sequence[Sweep]]:
+    """The sweeps of one path: point files as a tuple, recordings each by itself."""
+    if recording := _recording_format(path):
+        return [recording.open(path, topic)]
     if path.is_file():
-        return (_sweep_at(path),)
+        if format_of(path) is None:
+            known = ", ".join((*POINT_SUFFIXES, *RECORDING_SUFFIXES))
+            raise InputError(f"{path}: not a known kind of points; give one of {known}.")
+        return [(_sweep_at(path),)]
     if not path.is_dir():
         raise InputError(f"{path}: there is no such file or folder; check the path.")
-    if files := _find_points(path):
-        return tuple(_sweep_at(file) for file in files)
+    if files := _find_points(path, POINT_FORMATS[:-1]):
+        return [tuple(_sweep_at(file) for file in files)]
+    # Text comes last: it may as well be somebody's notes.
+    if recordings := [file for file in sorted(path.iterdir()) if _recording_format(file)]:
+        return [part for file in recordings for part in _open_path(file, topic)]
+    if files := _find_points(path, (TEXT,)):
+        return [tuple(_sweep_at(file) for file in files)]
     raise InputError(
-        f"{path}: no points there. Give a point file ({', '.join(POINT_SUFFIXES)}), a folder of them, or a "
-        f"folder that holds {', '.join(_SEARCHED)}."
+        f"{path}: no points there. Give a point file ({', '.join(POINT_SUFFIXES)}), a recording "
+        f"({', '.join(RECORDING_SUFFIXES)}), a folder of them, or a folder that holds {', '.join(_SEARCHED)}."
     )
 
 
-def _find_points(path: pathlib.Path) -> list[pathlib.Path]:
-    """The point files of the first place that has any, all of one kind."""
+def _recording_format(path: pathlib.Path) -> RecordingFormat | None:
+    if path.name.startswith("."):
+        return None
+    suffix = suffix_of(path, RECORDING_SUFFIXES) if path.is_file() else None
+    for recording in RECORDING_FORMATS:
+        if suffix in recording.suffixes or (path.is_dir() and recording.is_folder(path)):
+            return recording
+    return None
+
+
+def _distinct(sweeps: list[Sweep]) -> tuple[Sweep, ...]:
+    """The sweeps; where two have one name, as in different folders, the folder's stands before it."""
+    counts = collections.Counter(sweep.name for sweep in sweeps)
+    named = tuple(
+        dataclasses.replace(sweep, name=f"{sweep.points_path.parent.name}_{sweep.name}")
+        if counts[sweep.name] > 1
+        else sweep
+        for sweep in sweeps
+    )
+    _check_distinct([sweep.name for sweep in named], [sweep.points_path for sweep in named])
+    return named
+
+
+def _check_distinct(names: Sequence[str], paths: Sequence[pathlib.Path]) -> None:
+    first: dict[str, pathlib.Path] = {}
+    for name, path in zip(names, paths, strict=True):
+        if name in first:
+            raise InputError(
+                f"{path}: its sweep would be named {name}, as that of {first[name]}, and share its results. "
+                "Open the two one after the other."
+            )
+        first[name] = path
+
+
+class _Chain(Sequence[Sweep]):
+    """Several recordings, or recordings and files, one after the other."""
+
+    def __init__(self, parts: Sequence[Sequence[Sweep]]) -> None:
+        recordings = [part.path for part in parts if isinstance(part, RecordedSweeps)]
+        _check_distinct([path.stem for path in recordings], recordings)
+        self._parts = parts
+        self._ends = list(itertools.accumulate(len(part) for part in parts))
+
+    def __len__(self) -> int:
+        return self._ends[-1]
+
+    def __iter__(self) -> Iterator[Sweep]:
+        return itertools.chain.from_iterable(self._parts)
+
+    @overload
+    def __getitem__(self, index: int) -> Sweep: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[Sweep, ...]: ...
+    def __getitem__(self, index: int | slice) -> Sweep | tuple[Sweep, ...]:
+        wanted = range(len(self))[index]
+        if isinstance(wanted, int):
+            part = bisect.bisect_right(self._ends, wanted)
+            return self._parts[part][wanted - (self._ends[part - 1] if part else 0)]
+        return tuple(self[i] for i in wanted)
+
+
+def _find_points(path: pathlib.Path, formats: Sequence[PointFormat]) -> list[pathlib.Path]:
+    """The point files of the first place that has any, all of one format."""
     layouts = list(_layout_folders(path))
-    # Binary points are taken where they lie, but .txt files beside a known layout are its calibration.
-    searches = [(suffix, folders) for suffix in TEXT_SUFFIXES for folders in [*layouts, [path]]]
-    searches = [(".bin", folders) for folders in [[path], *layouts]] + searches
-    return next((files for search in searches if (files := _point_files(*search))), [])
+    for point_format in formats:
+        # Points are taken where they lie, but .txt files beside a known layout are its calibration.
+        places = [*layouts, [path]] if point_format is TEXT else [[path], *layouts]
+        for folders in places:
+            if files := _point_files(point_format, folders):
+                return files
+    return []
 
 
 def _layout_folders(path: pathlib.Path) -> Iterator[list[pathlib.Path]]:
@@ -157,10 +202,15 @@ def _layout_folders(path: pathlib.Path) -> Iterator[list[pathlib.Path]]:
             yield sorted(folder for folder in path.glob(pattern) if folder.is_dir())
 
 
-def _point_files(suffix: str, folders: list[pathlib.Path]) -> list[pathlib.Path]:
-    files = [file for folder in folders for file in sorted(folder.glob(f"*{suffix}"))]
+def _point_files(point_format: PointFormat, folders: list[pathlib.Path]) -> list[pathlib.Path]:
     # Hidden files are other programs' leftovers.
-    return [file for file in files if not file.name.startswith(".")]
+    files = [file for folder in folders for file in sorted(folder.iterdir()) if not file.name.startswith(".")]
+    files = [file for file in files if format_of(file) is point_format]
+    if point_format is TEXT and files:
+        # One kind of text only: a .csv beside .xyz files is something else.
+        suffix = min((file.suffix.lower() for file in files), key=TEXT.suffixes.index)
+        return [file for file in files if file.suffix.lower() == suffix]
+    return files
 
 
 def _sweep_at(file: pathlib.Path) -> Sweep:
@@ -171,7 +221,10 @@ def _sweep_at(file: pathlib.Path) -> Sweep:
         return _tracking_sweep(file, folder.parent.parent)
     if folder.name == "data" and folder.parent.name == "velodyne_points":
         return _raw_sweep(file, folder.parent.parent)
-    return Sweep(file.stem, file)
+    found = format_of(file)
+    suffix = suffix_of(file, POINT_SUFFIXES) or ""
+    timestamp_ns = None if found is None else found.timestamp_ns(file)
+    return Sweep(file.name[: len(file.name) - len(suffix)], file, timestamp_ns=timestamp_ns)
 
 
 def _object_sweep(file: pathlib.Path, root: pathlib.Path) -> Sweep:
@@ -204,7 +257,37 @@ def _raw_sweep(file: pathlib.Path, drive: pathlib.Path) -> Sweep:
         points_path=file,
         calibration_path=drive.parent if calibrated else None,
         image_path=_image(drive / "image_02" / "data", file.stem),
+        timestamp_ns=_raw_time_ns(file),
     )
+
+
+def _raw_time_ns(file: pathlib.Path) -> int | None:
+    """The time of a sweep of a raw drive; its files are numbered by the lines of ``timestamps.txt``."""
+    times = file.parent.parent / "timestamps.txt"
+    if not file.stem.isdecimal() or not times.is_file():
+        return None
+    lines = _read_lines(times, times.stat().st_mtime_ns)
+    return _parse_time_ns(lines[int(file.stem)]) if int(file.stem) < len(lines) else None
+
+
+@functools.lru_cache(maxsize=4)
+def _read_lines(path: pathlib.Path, _changed_ns: int) -> list[str]:
+    """Lines of a file that each sweep of a drive asks for, read once while it stays as it is."""
+    return read_text(path).splitlines()
+
+
+def _parse_time_ns(line: str) -> int | None:
+    """Nanoseconds of a line such as ``2011-09-26 13:02:25.594360375``; KITTI names no zone, so UTC is taken.
+
+    >>> _parse_time_ns("1970-01-01 00:01:00.000000005")
+    60000000005
+    """
+    whole, _, fraction = line.strip().partition(".")
+    try:
+        moment = datetime.datetime.fromisoformat(whole).replace(tzinfo=datetime.UTC)
+        return int(moment.timestamp()) * 10**9 + int(fraction[:9].ljust(9, "0"))
+    except ValueError:
+        return None
 
 
 def _existing(path: pathlib.Path) -> pathlib.Path | None:

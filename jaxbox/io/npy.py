@@ -1,0 +1,127 @@
+"""NumPy's own files: an array of points in .npy, or the array of that name in .npz."""
+
+import os
+import pathlib
+import zipfile
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from jaxbox.io._files import InputError
+from jaxbox.io.points import MAX_POINTS, PointFormat, Points, named_points
+
+ARRAY_NAMES = ("points", "xyz", "pointcloud", "data", "arr_0")
+"""Arrays that are looked for in a .npz file of several, in this order; its only one needs no name."""
+
+_COLUMNS = ("x", "y", "z", "intensity")
+_MAX_VALUES = 64 * MAX_POINTS
+_READ_ERRORS = (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile)
+
+
+def read_npy(path: str | os.PathLike[str]) -> Points:
+    """Reads a .npy file: (n, 3 or more) numbers x, y, z, intensity, or records with such fields.
+
+    Args:
+      path: the file.
+
+    Returns:
+      As `jaxbox.io.read_points`.
+
+    Raises:
+      InputError: where it is no such array, or is cut short.
+    """
+    try:
+        # A map, so that a header that claims more than the file holds asks for no memory.
+        points = np.load(path, mmap_mode="r", allow_pickle=False)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: there is no such file; check the path.") from error
+    except _READ_ERRORS as error:
+        if _is_empty_array(path):
+            return np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+        raise InputError(f"{path}: no readable .npy array ({error}); save it again with np.save.") from error
+    return _array_points(points, str(path))
+
+
+def _is_empty_array(path: str | os.PathLike[str]) -> bool:
+    """Whether this is a whole file of an array without values, which cannot be mapped."""
+    try:
+        with pathlib.Path(path).open("rb") as file:
+            return 0 in _read_shape(file)
+    except _READ_ERRORS:
+        return False
+
+
+def read_npz(path: str | os.PathLike[str]) -> Points:
+    """Reads a .npz file: its only array, or the one named points, xyz, pointcloud, data or arr_0.
+
+    Arrays named x, y and z (and intensity) of n values each are taken too.
+
+    Args:
+      path: the file.
+
+    Returns:
+      As `jaxbox.io.read_points`.
+
+    Raises:
+      InputError: where it is no such file, or holds no such array.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            if {"x", "y", "z"} <= set(arrays.files):
+                names = [name for name in _COLUMNS if name in arrays.files]
+            else:
+                names = [_array_name(arrays.files, str(path))]
+            for name in names:
+                _check_member(arrays.zip, f"{name}.npy", str(path))
+            found = {name: arrays[name] for name in names}
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: there is no such file; check the path.") from error
+    except InputError:
+        raise
+    except (*_READ_ERRORS, AttributeError) as error:
+        raise InputError(f"{path}: no readable .npz file ({error}); save it again with np.savez.") from error
+    if len(found) > 1:
+        return named_points(found, str(path))
+    return _array_points(next(iter(found.values())), str(path))
+
+
+def _array_name(names: list[str], where: str) -> str:
+    if len(names) == 1:
+        return names[0]
+    for name in ARRAY_NAMES:
+        if name in names:
+            return name
+    raise InputError(
+        f"{where}: holds {', '.join(names) or 'no array'}; name the points one of {', '.join(ARRAY_NAMES)}."
+    )
+
+
+def _check_member(archive: Any, member: str, where: str) -> None:
+    """Refuses an array larger than what the archive says it unpacks to."""
+    with archive.open(member) as file:
+        shape = _read_shape(file)
+    if np.prod(shape, dtype=float) > min(_MAX_VALUES, archive.getinfo(member).file_size):
+        raise InputError(f"{where}: {member} claims the shape {shape}, more than is there; save it again.")
+
+
+def _read_shape(file: BinaryIO) -> tuple[int, ...]:
+    version = np.lib.format.read_magic(file)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    if version not in read:
+        raise ValueError(f"version {version} of the format")
+    return read[version](file)[0]
+
+
+def _array_points(points: np.ndarray, where: str) -> Points:
+    if points.dtype.names and points.ndim == 1:
+        return named_points({name: points[name] for name in points.dtype.names}, where)
+    if points.ndim != 2 or points.shape[1] < len("xyz") or points.dtype.kind not in "fiu":
+        raise InputError(
+            f"{where}: the array is {points.dtype} of shape {points.shape}; points are (n, 3 or more) real "
+            "numbers: x, y, z, intensity."
+        )
+    return named_points(dict(zip(_COLUMNS, points.T, strict=False)), where)
+
+
+NPY = PointFormat(name="NumPy array", suffixes=(".npy",), read=read_npy)
+NPZ = PointFormat(name="NumPy archive", suffixes=(".npz",), read=read_npz)

@@ -1,0 +1,120 @@
+"""PCD, the Point Cloud Library's format: ascii, binary and binary_compressed, by way of pypcd4.
+
+What a header claims is held against the file before any memory is asked for. The text body is read here:
+pypcd4 takes exactly one blank between numbers, and real files have more.
+"""
+
+import io
+import os
+import pathlib
+import struct
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from jaxbox.io._extras import require
+from jaxbox.io._files import InputError
+from jaxbox.io.points import PointFormat, Points, check_num_bytes, check_num_points, named_points
+
+_MAX_HEADER_LINES = 64
+_MAX_LINE_BYTES = 65536
+_LENGTHS = struct.Struct("<II")
+_LZF_BEST_RATIO = 100
+"""LZF codes at most 264 bytes in 3."""
+
+
+def read_pcd(path: str | os.PathLike[str]) -> Points:
+    """Reads a PCD file; points of an organised cloud come row by row.
+
+    Args:
+      path: the file.
+
+    Returns:
+      As `jaxbox.io.read_points`.
+
+    Raises:
+      InputError: where it is no PCD file, is cut short, or has no x, y, z.
+      ImportError: without the extra ``pcd``.
+    """
+    pypcd4 = require("pypcd4", extra="pcd", what="PCD files")
+    try:
+        with pathlib.Path(path).open("rb") as file:
+            lines = _read_header_lines(file, str(path))
+            header = _parse_header(lines, pypcd4, str(path))
+            check_num_points(header.points, str(path))
+            if header.data.value == "ascii":
+                return named_points(_read_ascii(file, header, str(path)), str(path))
+            _check_body(file, header, pathlib.Path(path))
+            whole = io.BytesIO("\n".join([*lines, ""]).encode() + file.read())
+            try:
+                cloud = pypcd4.PointCloud.from_fileobj(whole).pc_data
+            except (ValueError, RuntimeError, struct.error) as error:
+                raise InputError(f"{path}: the points cannot be read ({error}); copy it again.") from error
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: there is no such file; check the path.") from error
+    return named_points({name: cloud[name] for name in cloud.dtype.names}, str(path))
+
+
+def _read_header_lines(file: BinaryIO, where: str) -> list[str]:
+    """The header's lines, without comments and with a line COUNT."""
+    lines = []
+    while len(lines) < _MAX_HEADER_LINES and (line := file.readline(_MAX_LINE_BYTES)):
+        lines.append(line.decode("ascii", "replace").strip())
+        if lines[-1].upper().startswith("DATA"):
+            break
+    else:
+        raise InputError(f"{where}: no PCD file, as no line DATA ends its header.")
+    lines = [line for line in lines if line and not line.startswith("#")]
+    words = {line.split()[0].upper(): line.split()[1:] for line in lines}
+    if "COUNT" not in words and "FIELDS" in words:
+        # PCL takes a missing line COUNT for ones.
+        lines.insert(-1, f"COUNT {' '.join('1' * len(words['FIELDS']))}")
+    return lines
+
+
+def _parse_header(lines: list[str], pypcd4: Any, where: str) -> Any:
+    try:
+        header = pypcd4.MetaData.parse_header(lines)
+        header.build_dtype()
+    except (ValueError, KeyError, IndexError, TypeError) as error:
+        problem = "; ".join(str(error).splitlines()[:3])
+        raise InputError(f"{where}: the PCD header cannot be read ({problem}); write it again.") from error
+    return header
+
+
+def _check_body(file: BinaryIO, header: Any, path: pathlib.Path) -> None:
+    """Holds the sizes in header and body against the file's."""
+    there = path.stat().st_size - file.tell()
+    needed = header.points * header.build_dtype().itemsize
+    if header.data.value == "binary":
+        check_num_bytes(needed, there, str(path))
+    elif header.points:
+        lengths = file.read(_LENGTHS.size)
+        file.seek(-len(lengths), os.SEEK_CUR)
+        check_num_bytes(_LENGTHS.size, len(lengths), str(path))
+        compressed, uncompressed = _LENGTHS.unpack(lengths)
+        check_num_bytes(compressed, there - _LENGTHS.size, str(path))
+        if uncompressed != needed or uncompressed > _LZF_BEST_RATIO * compressed:
+            raise InputError(
+                f"{path}: {compressed} compressed bytes are to make {uncompressed}, and the header's points "
+                f"take {needed}. The file is damaged: copy or convert it again."
+            )
+
+
+def _read_ascii(file: BinaryIO, header: Any, where: str) -> dict[str, np.ndarray]:
+    names = header.build_dtype().names
+    try:
+        rows = (
+            np.loadtxt(file, ndmin=2, max_rows=header.points) if header.points else np.zeros((0, len(names)))
+        )
+    except ValueError as error:
+        raise InputError(f"{where}: {error}; each line of points needs {len(names)} numbers.") from error
+    if rows.shape != (header.points, len(names)):
+        raise InputError(
+            f"{where}: {rows.shape[0]} lines of {rows.shape[1]} numbers; the header promises "
+            f"{header.points} of {len(names)}. Copy the file again if it was cut short."
+        )
+    return dict(zip(names, rows.T, strict=True))
+
+
+PCD = PointFormat(name="PCD", suffixes=(".pcd",), read=read_pcd)

@@ -1,0 +1,96 @@
+"""PLY, the Stanford polygon format: the vertices of ascii, little-endian and big-endian files.
+
+Read here rather than by a library: the one that is maintained, plyfile, is under the GPL, which this
+package is not. The tests read what plyfile writes. Elements after the vertices are not looked at.
+"""
+
+import os
+import pathlib
+import re
+from typing import BinaryIO
+
+import numpy as np
+
+from jaxbox.io._files import InputError
+from jaxbox.io.points import PointFormat, Points, check_num_bytes, check_num_points, named_points
+
+_MAX_HEADER_LINES = 1024
+_MAX_LINE_BYTES = 65536
+_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
+    "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+
+
+def read_ply(path: str | os.PathLike[str]) -> Points:
+    """Reads the vertices of a PLY file.
+
+    Args:
+      path: the file.
+
+    Returns:
+      As `jaxbox.io.read_points`.
+
+    Raises:
+      InputError: where it is no PLY file, is cut short, does not begin with its vertices, or has no x, y, z.
+    """
+    path = pathlib.Path(path)
+    try:
+        with path.open("rb") as file:
+            order, count, dtype = _read_header(file, str(path))
+            check_num_points(count, str(path))
+            if order:
+                size = count * dtype.itemsize
+                check_num_bytes(size, path.stat().st_size - file.tell(), str(path))
+                vertices = np.frombuffer(file.read(size), dtype)
+            else:
+                vertices = _read_ascii(file, count, dtype, str(path))
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: there is no such file; check the path.") from error
+    return named_points({name: vertices[name] for name in dtype.names or ()}, str(path))
+
+
+def _read_header(file: BinaryIO, where: str) -> tuple[str, int, np.dtype]:
+    """Byte order (empty for ascii), number of vertices, and the type of a vertex."""
+    lines = []
+    while len(lines) < _MAX_HEADER_LINES and (line := file.readline(_MAX_LINE_BYTES)):
+        lines.append(line.decode("ascii", "replace").strip())
+        if lines[-1] == "end_header":
+            break
+    else:
+        lines = []
+    header = "\n".join(lines)
+    kind = re.match(r"ply\nformat (\w+) 1\.0$", header, re.MULTILINE)
+    if kind is None or kind[1] not in _ORDERS:
+        raise InputError(f"{where}: no PLY file; it must begin with ply, format and end in end_header.")
+    element, *_ = re.split(r"^(?=element )", header, flags=re.MULTILINE)[1:] or [""]
+    vertex = re.match(r"element vertex (\d+)$", element, re.MULTILINE)
+    if vertex is None:
+        raise InputError(f"{where}: the first element is no vertex; write the vertices before all else.")
+    order = _ORDERS[kind[1]]
+    properties = re.findall(r"^property (.+)$", element, re.MULTILINE)
+    fields = [
+        (name, order + _TYPES.get(kind, "")) for kind, _, name in (p.rpartition(" ") for p in properties)
+    ]
+    if unknown := [name for name, kind in fields if not kind.lstrip("<>")]:
+        raise InputError(f"{where}: vertex property {unknown[0]} is no number; leave it out.")
+    return order, int(vertex[1]), np.dtype(fields)
+
+
+def _read_ascii(file: BinaryIO, count: int, dtype: np.dtype, where: str) -> np.ndarray:
+    width = len(dtype.names or ())
+    try:
+        rows = np.loadtxt(file, ndmin=2, max_rows=count) if count else np.zeros((0, width))
+    except ValueError as error:
+        raise InputError(f"{where}: {error}; each line of a vertex needs {width} numbers.") from error
+    if rows.shape != (count, width):
+        raise InputError(
+            f"{where}: {rows.shape[0]} lines of {rows.shape[1]} numbers; the header promises {count} of "
+            f"{width}. Copy the file again if it was cut short."
+        )
+    return np.rec.fromarrays(rows.T, dtype=dtype)
+
+
+PLY = PointFormat(name="PLY", suffixes=(".ply",), read=read_ply)

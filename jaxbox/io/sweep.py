@@ -1,0 +1,90 @@
+"""One sweep, wherever it lies: its name, its time, and readers of what belongs to it."""
+
+import dataclasses
+import pathlib
+from collections.abc import Callable
+
+import numpy as np
+
+from jaxbox.io.images import read_image
+from jaxbox.io.kitti import KittiObject, read_labels
+from jaxbox.io.kitti_calibration import IMAGE_SIZE_PX, read_calibration, read_raw_calibration
+from jaxbox.io.points import Points
+from jaxbox.io.registry import read_points
+from jaxbox.types import Calibration
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """One LiDAR sweep and the files that belong to it; nothing is read before it is asked for."""
+
+    name: str
+    """Unique among the sweeps of a folder, fit for a file name: "000001", "0000_000001" (tracking),
+    "2011_09_26_drive_0052_sync_0000000001" (raw) or "drive_000001" (second sweep of ``drive.bag``)."""
+    points_path: pathlib.Path
+    """The points, or the recording that holds them."""
+    calibration_path: pathlib.Path | None = None
+    """A ``calib/*.txt`` file, or for raw recordings the day's folder; None where there is none."""
+    labels_path: pathlib.Path | None = None
+    """The label file; None where there is none."""
+    image_path: pathlib.Path | None = None
+    """The left colour camera's image; None where there is none."""
+    frame: int | None = None
+    """Frame within the sequence, which picks this sweep's lines of a tracking label file."""
+    timestamp_ns: int | None = None
+    """When it was taken, ns since 1970, as far as file name or recording say; None where they do not."""
+    decode: Callable[[], Points] | None = dataclasses.field(default=None, repr=False, compare=False)
+    """Decodes the points of a sweep within a recording; None where `points_path` holds this sweep alone."""
+
+    def read_points(self) -> Points:
+        """Reads the points.
+
+        Returns:
+          xyz: (n, 3) float32, m, sensor frame; NaN and infinity are kept for the detector to count.
+          intensity: (n,) float32, the file's own unit; 0 where unknown.
+
+        Raises:
+          InputError: naming the file, where it cannot be read.
+          ImportError: naming the extra that its format needs, where that is not installed.
+        """
+        return read_points(self.points_path) if self.decode is None else self.decode()
+
+    def read_calibration(self) -> Calibration | None:
+        """Reads the calibration of the left colour camera.
+
+        Returns:
+          The camera, with the image's size; or the raw calibration's size, or 1242 x 375, where there
+          is no image. None where the sweep has no calibration.
+
+        Raises:
+          InputError: naming the file, where it or the image cannot be read.
+        """
+        if self.calibration_path is None:
+            return None
+        image = self.read_image()
+        size = None if image is None else (image.shape[1], image.shape[0])
+        if self.calibration_path.is_dir():
+            return read_raw_calibration(self.calibration_path, image_size_px=size)
+        return read_calibration(self.calibration_path, image_size_px=size or IMAGE_SIZE_PX)
+
+    def read_labels(self) -> list[KittiObject] | None:
+        """Reads the labels of this sweep.
+
+        Returns:
+          The objects, none of them for an empty frame; or None where the sweep has no labels.
+
+        Raises:
+          InputError: naming file and line, where it cannot be read.
+        """
+        return None if self.labels_path is None else read_labels(self.labels_path, frame=self.frame)
+
+    def read_image(self) -> np.ndarray | None:
+        """Reads the left colour camera's image.
+
+        Returns:
+          (height, width, 3) uint8, RGB; or None where the sweep has no image.
+
+        Raises:
+          InputError: naming the file, where it cannot be decoded.
+        """
+        return None if self.image_path is None else read_image(self.image_path)
