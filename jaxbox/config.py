@@ -94,7 +94,7 @@ class GroundConfig:
     surface: bool = _static(default=True)
     """static: refine the plane by the ground grid; False stops at the planes (the paper)."""
     surface_cell_m: float = _static(default=0.5)
-    """static: edge of the ground grid's cells."""
+    """static: edge of the cells whose lowest points are ground; the ground grid's are twice as wide."""
     surface_half_m: float = _static(default=80.0)
     """static: the ground grid covers |x|, |y| below this; beyond it its border value holds."""
     num_envelope_rounds: int = _static(default=10)

@@ -7,8 +7,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import compact
+from jaxbox.masked import apart, compact, lookup
 from jaxbox.types import GroundPlane
+
+HYPOTHESES_AT_A_TIME = 32
+"""Planes tried together: few enough for their residuals to stay in the cache."""
 
 CANDIDATE_CELL_M = 1.0
 """Cells whose lowest points are candidates: wide enough that most cells near by see the road."""
@@ -22,8 +25,14 @@ FAR_FILL_WEIGHT = 0.02
 FAR_FILL_PRIOR = 0.015
 """Weight of the plane itself where the wide Gaussian has none either."""
 
-BAND_CELLS, TILE_CELLS = 24, 64
-"""Gaussians of no longer reach are applied to so many cells at a time; the default's just reach so far."""
+GOLDEN_RATIO_BITS = 0x9E3779B9
+"""2^32 over the golden ratio: its multiples fill the 32 bits evenly."""
+
+POOL_CELLS = 2
+"""The ground is smoothed on squares of so many cells: twice a cell is still no wider than the Gaussian."""
+
+WIDE_POOL_CELLS = 8
+"""The wide Gaussian works on squares of so many cells."""
 
 GAUSSIAN_TRUNCATION = 3.0
 """Gaussians reach so many standard deviations, as in scipy.ndimage.gaussian_filter(truncate=3)."""
@@ -93,6 +102,7 @@ def fit_ground_plane(
     tolerance_m: jax.Array | float,
     max_slope_deg: jax.Array | float,
     min_inlier_fraction: jax.Array | float,
+    round_index: int = 0,
 ) -> GroundPlane:
     """The plane with the most support: RANSAC, all hypotheses at once, then refits on all inliers.
 
@@ -108,6 +118,7 @@ def fit_ground_plane(
       tolerance_m: m.
       max_slope_deg: degrees.
       min_inlier_fraction: of the candidates.
+      round_index: another round draws other samples from the same key.
 
     Returns:
       The plane; `found` is False, and the plane level through the lowest candidate (or z = 0 where
@@ -117,18 +128,21 @@ def fit_ground_plane(
     """
     max_grade = jnp.tan(jnp.deg2rad(max_slope_deg))
 
-    def inliers(plane: jax.Array) -> jax.Array:
-        return mask & (jnp.abs(plane_residual(candidates, plane)) < tolerance_m) & _is_level(plane, max_grade)
+    def is_near(plane: jax.Array) -> jax.Array:
+        return mask & (jnp.abs(plane_residual(candidates, plane)) < tolerance_m)
+
+    def num(flags: jax.Array) -> jax.Array:
+        # In float32: sums of integers are several times slower (XLA, CPU).
+        return jnp.sum(flags, dtype=jnp.float32)
 
     index, count = compact(mask, mask.shape[0])
-    draws = jax.random.uniform(key, (num_hypotheses, 3))
+    draws = _draw(key, round_index, (num_hypotheses, 3))
     picks = index[jnp.minimum((draws * count).astype(jnp.int32), jnp.maximum(count - 1, 0))]
     planes = jax.vmap(_plane_through)(candidates[jnp.minimum(picks, mask.shape[0] - 1)])
-    support = jax.lax.map(lambda plane: jnp.sum(inliers(plane)), planes, batch_size=8)
-    plane = planes[jnp.argmax(support)]
-    for _ in range(num_refits):
-        plane = _refit(candidates, inliers(plane), plane)
-    num_inliers = jnp.sum(inliers(plane))
+    support = jax.lax.map(lambda plane: num(is_near(plane)), planes, batch_size=HYPOTHESES_AT_A_TIME)
+    best = planes[jnp.argmax(jnp.where(_is_level(planes.T, max_grade), support, 0))]
+    plane = jax.lax.fori_loop(0, num_refits, lambda _, p: _refit(candidates, is_near(p), p), best)
+    num_inliers = jnp.where(_is_level(plane, max_grade), num(is_near(plane)), 0).astype(jnp.int32)
     found = (num_inliers >= 3) & (num_inliers >= min_inlier_fraction * count)
     lowest = jnp.min(jnp.where(mask, candidates[:, 2], jnp.inf))
     level = jnp.array([0.0, 0.0, 1.0]) * jnp.where(jnp.isfinite(lowest), lowest, 0)
@@ -160,8 +174,8 @@ def fit_ground_planes(
     """
     fits: list[GroundPlane] = []
     planes = []
-    for round_key in jax.random.split(key, max_planes):
-        plane = fit_ground_plane(candidates, mask, round_key, tolerance_m=tolerance_m, **options)
+    for i in range(max_planes):
+        plane = fit_ground_plane(candidates, mask, key, round_index=i, tolerance_m=tolerance_m, **options)
         fits.append(plane)
         planes.append(jnp.where(plane.found, plane.coefficients, fits[0].coefficients))
         covered = jnp.abs(plane_residual(candidates, plane.coefficients)) < tolerance_m
@@ -193,9 +207,28 @@ def height_above_planes(xyz: jax.Array, planes: jax.Array, *, tolerance_m: jax.A
     Returns:
       (N,) float32, m; a point below all planes gets its height over the lowest one there.
     """
+    if planes.shape[0] == 1:
+        return plane_residual(xyz, planes[0])
     residual = jnp.stack([plane_residual(xyz, plane) for plane in planes])
     above = jnp.min(jnp.where(residual >= -tolerance_m, residual, jnp.inf), axis=0)
     return jnp.where(jnp.isfinite(above), above, jnp.max(residual, axis=0))
+
+
+def _draw(key: jax.Array, round_index: int, shape: tuple[int, int]) -> jax.Array:
+    """Numbers in [0, 1), even enough for RANSAC: hashes of the key, far cheaper than `jax.random`."""
+    state = jnp.uint32(round_index)
+    for word in jax.random.key_data(key).reshape(-1):
+        state = _scramble(state ^ word)
+    counter = jnp.arange(math.prod(shape), dtype=jnp.uint32).reshape(shape)
+    # The upper 24 bits: float32 holds no more.
+    return (_scramble(counter * jnp.uint32(GOLDEN_RATIO_BITS) + state) >> 8).astype(jnp.float32) / 2**24
+
+
+def _scramble(word: jax.Array) -> jax.Array:
+    """A bijection of 32 bits in which each bit depends on all: the last step of MurmurHash3."""
+    word = (word ^ (word >> 16)) * jnp.uint32(0x85EBCA6B)
+    word = (word ^ (word >> 13)) * jnp.uint32(0xC2B2AE35)
+    return word ^ (word >> 16)
 
 
 def _plane_through(corners: jax.Array) -> jax.Array:
@@ -212,10 +245,11 @@ def _is_level(plane: jax.Array, max_grade: jax.Array) -> jax.Array:
 
 def _refit(candidates: jax.Array, inliers: jax.Array, plane: jax.Array) -> jax.Array:
     """Least-squares plane through the inliers, about their mean: float32 sums would cancel else."""
-    weight = inliers / jnp.maximum(jnp.sum(inliers), 1)
-    mean = weight @ jnp.where(inliers[:, None], candidates, 0)
-    centred = jnp.where(inliers[:, None], candidates - mean, 0)
-    cov = (centred * weight[:, None]).T @ centred
+    rows = candidates.T
+    count = jnp.maximum(jnp.sum(inliers, dtype=jnp.float32), 1)
+    mean = jnp.sum(jnp.where(inliers, rows, 0), axis=1) / count
+    centred = jnp.where(inliers, rows - mean[:, None], 0)
+    cov = jnp.sum(centred[:, None] * centred, axis=-1) / count
     determinant = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
     a = (cov[0, 2] * cov[1, 1] - cov[1, 2] * cov[0, 1]) / determinant
     b = (cov[1, 2] * cov[0, 0] - cov[0, 2] * cov[0, 1]) / determinant
@@ -245,7 +279,8 @@ def fit_ground_surface(
     """Height of the ground over the plane, on a grid, where the road is not flat.
 
     The lowest residual of each cell, where it lies near the plane, is ground if no ground cell near by
-    is so much lower that the slope between would pass the limit; the rest is filled by Gaussians.
+    is so much lower that the slope between would pass the limit; the rest is filled by Gaussians, on
+    squares of cells.
 
     Args:
       xyz: (N, 3) float32, m.
@@ -264,21 +299,20 @@ def fit_ground_surface(
       smoothing_m: standard deviation of the narrow Gaussian, m.
 
     Returns:
-      (G, G) float32, m: height of the ground over the plane at the cells' centres.
+      (G, G) float32, m: height of the ground over the plane at the centres of squares of 2 x 2 cells.
 
     Reference: oracle `jaxbox.reference.fit_ground_surface`.
     """
     n = round(2 * half_m / cell_m)
     residual = plane_residual(xyz, plane)
-    rho = jnp.hypot(xyz[:, 0], xyz[:, 1])
+    rho = jnp.sqrt(xyz[:, 0] ** 2 + xyz[:, 1] ** 2)
     near_plane = (residual > -band_below_m - band_below_grade * rho) & (
         residual < band_above_m + band_above_grade * rho
     )
-    index = jnp.floor((xyz[:, :2] + half_m) / cell_m).astype(jnp.int32)
-    inside = jnp.all((index >= 0) & (index < n), axis=1)
-    cell = jnp.where(
-        mask & near_plane & inside & (rho > blind_radius_m), index[:, 0] * n + index[:, 1], n * n
-    )
+    # Axis by axis: the compiler vectorises along the points, not along so short a row.
+    i, j = (jnp.floor((xyz[:, axis] + half_m) / cell_m).astype(jnp.int32) for axis in (0, 1))
+    inside = (i >= 0) & (i < n) & (j >= 0) & (j < n)
+    cell = jnp.where(mask & near_plane & inside & (rho > blind_radius_m), i * n + j, n * n)
     lowest = jnp.full(n * n, jnp.inf).at[cell].min(residual, mode="drop").reshape(n, n)
     envelope = _lower_envelope(lowest, max_grade * cell_m, num_envelope_rounds)
     ground = jnp.isfinite(lowest) & (lowest < envelope + envelope_margin_m)
@@ -287,87 +321,105 @@ def fit_ground_surface(
 
 def _lower_envelope(lowest: jax.Array, step_m: jax.Array | float, num_rounds: int) -> jax.Array:
     """The highest surface below the cells that rises by at most `step_m` a cell, near each cell."""
-    n = lowest.shape[0]
 
-    def spread(_: int, envelope: jax.Array) -> jax.Array:
-        e = jnp.pad(envelope, 1, constant_values=jnp.inf)
-        shifted = {(i, j): e[1 + i : 1 + i + n, 1 + j : 1 + j + n] for i in (-1, 0, 1) for j in (-1, 0, 1)}
-        straight = [v for (i, j), v in shifted.items() if abs(i) + abs(j) == 1]
-        diagonal = [v for (i, j), v in shifted.items() if abs(i) + abs(j) == 2]
-        beside = jnp.minimum(jnp.minimum(straight[0], straight[1]), jnp.minimum(straight[2], straight[3]))
-        across = jnp.minimum(jnp.minimum(diagonal[0], diagonal[1]), jnp.minimum(diagonal[2], diagonal[3]))
-        return jnp.minimum(envelope, jnp.minimum(beside + step_m, across + math.sqrt(2) * step_m))
+    def spread(jump: int, envelope: jax.Array) -> jax.Array:
+        size = envelope.shape[0] - 2 * jump
+        at = [
+            [envelope[i : i + size, j : j + size] for j in (0, jump, 2 * jump)] for i in (0, jump, 2 * jump)
+        ]
+        beside = jnp.minimum(jnp.minimum(at[0][1], at[2][1]), jnp.minimum(at[1][0], at[1][2]))
+        across = jnp.minimum(jnp.minimum(at[0][0], at[0][2]), jnp.minimum(at[2][0], at[2][2]))
+        rise = jump * step_m
+        return jnp.minimum(at[1][1], jnp.minimum(beside + rise, across + math.sqrt(2) * rise))
 
-    return jax.lax.fori_loop(0, num_rounds, spread, lowest)
+    # The margin wears off jump by jump. No way between two cells is shorter for leading through it.
+    envelope = jnp.pad(lowest, num_rounds, constant_values=jnp.inf)
+    for jump in _jumps(num_rounds):
+        # Apart, or the compiler works out each cell nine times for the next jump.
+        envelope = apart(functools.partial(spread, jump), envelope, proof=lowest[0, 0] > -jnp.inf)
+    return envelope
+
+
+def _jumps(num_rounds: int) -> list[int]:
+    """Jumps straight or across that lead wherever so many single steps do, at the same cost.
+
+    >>> _jumps(10)
+    [1, 1, 2, 2, 4]
+    """
+    jumps: list[int] = []
+    while sum(jumps) < num_rounds:
+        jumps.append(min(2 ** (len(jumps) // 2), num_rounds - sum(jumps)))
+    return jumps
 
 
 def _smooth(height: jax.Array, weight: jax.Array, sigma_cells: jax.Array | float) -> jax.Array:
-    """Weighted Gaussian mean of the heights, filled from one so much wider."""
-    n = height.shape[0]
-    sigmas = [width * sigma_cells for width in (FAR_FILL_WIDTH, 1)]
-
-    def blur_both(tile: int, reach: int) -> list[tuple[jax.Array, jax.Array]]:
-        return [_blur(height, weight, _gaussian_taps(n, sigma), tile, reach) for sigma in sigmas]
-
-    (far_height, far_weight), (near_height, near_weight) = jax.lax.cond(
-        _gaussian_reach(sigmas[0]) <= BAND_CELLS,
-        lambda: blur_both(TILE_CELLS, BAND_CELLS),
-        lambda: blur_both(n, n),
+    """Weighted Gaussian mean of the heights, filled from one so much wider, on pooled cells."""
+    grids = [_pool(grid, POOL_CELLS) for grid in (height, weight)]
+    ratio = WIDE_POOL_CELLS // POOL_CELLS
+    near, near_weight = _blur(grids, sigma_cells / POOL_CELLS)
+    far, far_weight = _blur(
+        [_pool(grid, ratio) for grid in grids], FAR_FILL_WIDTH * sigma_cells / WIDE_POOL_CELLS
     )
-    far = far_height / (far_weight + FAR_FILL_PRIOR)
-    return (near_height + FAR_FILL_WEIGHT * far) / (near_weight + FAR_FILL_WEIGHT)
+    far = _enlarge(far / (far_weight + FAR_FILL_PRIOR), near.shape[0], ratio)
+    return (near + FAR_FILL_WEIGHT * far) / (near_weight + FAR_FILL_WEIGHT)
 
 
-def _blur(
-    height: jax.Array, weight: jax.Array, taps: jax.Array, tile: int, reach: int
-) -> tuple[jax.Array, jax.Array]:
+def _pool(grid: jax.Array, size: int) -> jax.Array:
+    """Means over squares of cells; cells beyond the border count as 0."""
+    grid = jnp.pad(grid, (0, -grid.shape[0] % size))
+    rows = functools.reduce(jnp.add, [grid[i::size] for i in range(size)])
+    return functools.reduce(jnp.add, [rows[:, i::size] for i in range(size)]) / size**2
+
+
+def _blur(grids: list[jax.Array], sigma_cells: jax.Array | float) -> tuple[jax.Array, jax.Array]:
     """Both grids blurred along both axes; cells beyond the border count as 0.
 
-    The Gaussian is separable, and a product with a banded matrix is the fastest convolution here: tile by
-    tile, since the band is narrow, all tiles with one matrix.
+    The Gaussian is separable, and a product with a matrix is the fastest convolution of a grid so small.
     """
-    n = height.shape[0]
-    starts = range(0, n, tile)
-    offset = jnp.arange(tile + 2 * reach) - reach - jnp.arange(tile)[:, None]
-    matrix = jnp.where(jnp.abs(offset) < n, taps[jnp.clip(offset + n - 1, 0, 2 * n - 2)], 0)
+    n = grids[0].shape[0]
+    taps = _gaussian_taps(n, sigma_cells)
+    index = jnp.arange(n)
+    matrix = taps[index - index[:, None] + n - 1]
     product = functools.partial(jnp.matmul, precision="highest")
-    margin = (reach, reach + -n % tile)
-    rows = jnp.pad(jnp.concatenate([height, weight], axis=1), (margin, (0, 0)))
-    rows = jnp.concatenate([product(matrix, rows[i : i + tile + 2 * reach]) for i in starts])[:n]
-    columns = jnp.pad(jnp.concatenate([rows[:, :n], rows[:, n:]]), ((0, 0), margin))
-    blurred = [product(columns[:, i : i + tile + 2 * reach], matrix.T) for i in starts]
-    blurred = jnp.concatenate(blurred, axis=1)[:, :n]
-    return blurred[:n], blurred[n:]
-
-
-def _gaussian_reach(sigma: jax.Array | float) -> jax.Array:
-    """Cells that a Gaussian reaches to either side."""
-    return jnp.floor(GAUSSIAN_TRUNCATION * sigma + 0.5)
+    rows = product(matrix, jnp.concatenate(grids, axis=1))
+    blurred = product(rows.reshape(2 * n, n), matrix).reshape(n, 2, n)
+    return blurred[:, 0], blurred[:, 1]
 
 
 def _gaussian_taps(n: int, sigma: jax.Array | float) -> jax.Array:
     """(2 n - 1,) float32: the Gaussian from n - 1 cells before its middle to as many after."""
     offset = jnp.arange(-(n - 1), n)
-    taps = jnp.where(jnp.abs(offset) <= _gaussian_reach(sigma), jnp.exp(-0.5 * (offset / sigma) ** 2), 0)
+    reach = jnp.floor(GAUSSIAN_TRUNCATION * sigma + 0.5)
+    taps = jnp.where(jnp.abs(offset) <= reach, jnp.exp(-0.5 * (offset / sigma) ** 2), 0)
     return taps / jnp.sum(taps)
 
 
+def _enlarge(grid: jax.Array, size: int, ratio: int) -> jax.Array:
+    """The grid on cells smaller by the ratio, bilinear between its own; its border holds beyond it."""
+    n = grid.shape[0]
+    at = jnp.clip((jnp.arange(size) + 0.5) / ratio - 0.5, 0, n - 1)
+    matrix = jnp.maximum(1 - jnp.abs(at[:, None] - jnp.arange(n)), 0)
+    product = functools.partial(jnp.matmul, precision="highest")
+    return product(product(matrix, grid), matrix.T)
+
+
 def surface_height(surface: jax.Array, xy: jax.Array, *, cell_m: float, half_m: float) -> jax.Array:
-    """Height of the ground grid over the plane, bilinear between the cells' centres.
+    """Height of the ground grid over the plane, bilinear between the centres of its squares.
 
     Args:
       surface: (G, G) float32, m.
       xy: (..., 2) float32, m; beyond the grid its border holds.
-      cell_m: static, edge of the cells.
+      cell_m: static, edge of the cells of `fit_ground_surface`.
       half_m: static, the grid covers |x|, |y| below it.
 
     Returns:
       (...) float32, m.
     """
     n = surface.shape[0]
-    at = jnp.clip((xy + half_m) / cell_m - 0.5, 0, n - 1.001)
-    i, j = at[..., 0].astype(jnp.int32), at[..., 1].astype(jnp.int32)
-    u, v = at[..., 0] - i, at[..., 1] - j
-    near = surface[i, j] * (1 - v) + surface[i, j + 1] * v
-    far = surface[i + 1, j] * (1 - v) + surface[i + 1, j + 1] * v
+    # Axis by axis: the compiler vectorises along the points, not along so short a row.
+    at = [jnp.clip((xy[..., a] + half_m) / (POOL_CELLS * cell_m) - 0.5, 0, n - 1.001) for a in (0, 1)]
+    i, j = (value.astype(jnp.int32) for value in at)
+    u, v = at[0] - i, at[1] - j
+    near = lookup(surface, i, j) * (1 - v) + lookup(surface, i, j + 1) * v
+    far = lookup(surface, i + 1, j) * (1 - v) + lookup(surface, i + 1, j + 1) * v
     return near * (1 - u) + far * u

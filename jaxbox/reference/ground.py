@@ -11,6 +11,10 @@ WIDE_WEIGHT = 0.015
 """Weight of "no deviation from the plane" in the wide Gaussian."""
 NARROW_WEIGHT = 0.02
 """Weight of the wide Gaussian in the narrow one."""
+POOL_CELLS = 2
+"""The grid is smoothed on squares of so many cells, and is theirs."""
+WIDE_POOL_CELLS = 8
+"""So many for the wide Gaussian."""
 TRUNCATE = 3.0
 """The Gaussians end at this many standard deviations."""
 MIN_PLANE_POINTS = 3
@@ -186,8 +190,8 @@ def fit_ground_surface(
     """Deviation of the ground from the plane on a grid.
 
     Cell minima of the points near the plane, kept where they are within the margin of their lower
-    envelope of limited slope, then smoothed; empty cells are filled from 4 times farther away and,
-    beyond that, with the plane itself.
+    envelope of limited slope, then smoothed on squares of cells; empty ones are filled from 4 times
+    farther away and, beyond that, with the plane itself.
 
     Args:
       xyz: (n, 3) finite, m, sensor frame.
@@ -206,7 +210,7 @@ def fit_ground_surface(
       min_height_m: as in `plane_elevation`.
 
     Returns:
-      (X, Y) m, at the centres of the cells.
+      (X, Y) m, at the centres of squares of 2 x 2 cells.
     """
     num_cells = int(2 * half_m / cell_m)
     deviation = xyz[:, 2] - plane_elevation(xyz, coefficients, min_height_m=min_height_m)
@@ -235,13 +239,30 @@ def _lower_envelope(lowest: np.ndarray, *, step: float, num_rounds: int) -> np.n
 
 
 def _fill_and_smooth(lowest: np.ndarray, valid: np.ndarray, *, sigma: float) -> np.ndarray:
-    value, weight = np.where(valid, lowest, 0.0), valid.astype(np.float64)
+    value, weight = _pool(np.where(valid, lowest, 0.0), POOL_CELLS), _pool(valid, POOL_CELLS)
+    ratio = WIDE_POOL_CELLS // POOL_CELLS
 
-    def gaussian(grid: np.ndarray, width: float) -> np.ndarray:
-        return ndimage.gaussian_filter(grid, width * sigma, truncate=TRUNCATE, mode="constant")
+    def narrow(grid: np.ndarray) -> np.ndarray:
+        return ndimage.gaussian_filter(grid, sigma / POOL_CELLS, truncate=TRUNCATE, mode="constant")
 
-    wide = gaussian(value, WIDE_FACTOR) / (gaussian(weight, WIDE_FACTOR) + WIDE_WEIGHT)
-    return (gaussian(value, 1) + NARROW_WEIGHT * wide) / (gaussian(weight, 1) + NARROW_WEIGHT)
+    def wide(grid: np.ndarray) -> np.ndarray:
+        sigma_squares = WIDE_FACTOR * sigma / WIDE_POOL_CELLS
+        return ndimage.gaussian_filter(_pool(grid, ratio), sigma_squares, truncate=TRUNCATE, mode="constant")
+
+    at = (np.arange(len(value)) + 0.5) / ratio - 0.5
+    fill = ndimage.map_coordinates(
+        wide(value) / (wide(weight) + WIDE_WEIGHT),
+        np.meshgrid(at, at, indexing="ij"),
+        order=1,
+        mode="nearest",
+    )
+    return (narrow(value) + NARROW_WEIGHT * fill) / (narrow(weight) + NARROW_WEIGHT)
+
+
+def _pool(grid: np.ndarray, size: int) -> np.ndarray:
+    """Means over squares of cells; 0 beyond the border."""
+    grid = np.pad(grid.astype(np.float64), (0, -len(grid) % size))
+    return grid.reshape(len(grid) // size, size, -1, size).mean(axis=(1, 3))
 
 
 def surface_deviation(xy: np.ndarray, grid: np.ndarray, *, cell_m: float, half_m: float) -> np.ndarray:
@@ -275,7 +296,7 @@ def ground_elevation(
       xyz: (n, 3) m; z only matters with several planes.
       coefficients: (3,) or (planes, 3).
       grid: (X, Y) m, or None for the plane alone.
-      cell_m: edge of the grid's cells.
+      cell_m: edge of the cells of `fit_ground_surface`.
       half_m: the grid covers |x|, |y| below this.
       min_height_m: as in `plane_elevation`.
 
@@ -285,7 +306,7 @@ def ground_elevation(
     elevation = plane_elevation(xyz, coefficients, min_height_m=min_height_m)
     if grid is None:
         return elevation
-    return elevation + surface_deviation(xyz[:, :2], grid, cell_m=cell_m, half_m=half_m)
+    return elevation + surface_deviation(xyz[:, :2], grid, cell_m=POOL_CELLS * cell_m, half_m=half_m)
 
 
 def height_above_ground(
