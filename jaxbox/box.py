@@ -1,62 +1,106 @@
 """Rectangles by trying all rotations (paper, section 3.4, Algorithm III), and the scene direction."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from jaxbox.masked import fold_points, group_by, map_rows
+from jaxbox.masked import fold_points, map_rows, sort_by_group, store, take
 from jaxbox.types import Rectangles
 
 CHUNK = 128
 """Clusters at a time: their extents at all rotations stay in the cache."""
 
-TABLE_CHUNK = 256
-"""Clusters whose points are listed at a time."""
-
 VOTE_POINTS, VOTE_EXTENT_M = 150.0, 6.0
 """A vote for the scene direction counts min(points, 150) x min(extent, 6 m)."""
 
+FAR_M = 1e12
+"""Farther away than any point."""
+
 Extents = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
-"""Lower and upper bounds of u, then of v, each (C, A)."""
+"""Lower and upper bounds of u, then of v, each (A, C)."""
 
-PointTable = tuple[jax.Array, jax.Array]
-"""Points (C, M, 2) m and how many of them count (C,)."""
+PointTable = tuple[jax.Array, jax.Array, jax.Array]
+"""x and y of points (M, C) m, and how many of them count (C,)."""
 
 
-def sample_points(cluster: jax.Array, *, num_clusters: int, max_points: int) -> tuple[jax.Array, jax.Array]:
-    """Gathers the points of each cluster in a table, spread evenly over it where there are too many.
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class PointLists:
+    """The points of each cluster, one list after the other."""
+
+    x: jax.Array
+    """(E,) float32, m."""
+    y: jax.Array
+    """(E,) float32, m."""
+    start: jax.Array
+    """(K,) int32, where the points of each cluster begin."""
+    total: jax.Array
+    """(K,) int32, how many they are."""
+    max_points: int = dataclasses.field(metadata={"static": True})
+    """static, M: so many of a cluster are looked at."""
+
+    @property
+    def count(self) -> jax.Array:
+        """(K,) int32, points of each cluster that are looked at."""
+        return jnp.minimum(self.total, self.max_points)
+
+    def table(self, cluster: jax.Array) -> PointTable:
+        """The points of some clusters, spread evenly over all they have: every (total / M)-th.
+
+        Args:
+          cluster: (C,) int32, in [0, K]; the latter has none.
+
+        Returns:
+          The points, in their order; those beyond the count may be anything finite.
+        """
+        start, total = take(self.start, cluster), take(self.total, cluster)
+        j = jnp.arange(self.max_points)[:, None]
+        spread = j * (total // self.max_points) + j * (total % self.max_points) // self.max_points
+        # Stored, since what a look-up has to work out first does not vectorise.
+        row = store(start + jnp.where(total > self.max_points, spread, j), jnp.all(total >= 0))
+        x, y = (jnp.take(values, row, mode="clip") for values in (self.x, self.y))
+        return x, y, jnp.minimum(total, self.max_points)
+
+
+def list_points(
+    cluster: jax.Array,
+    row: jax.Array,
+    num_entries: jax.Array,
+    xy: jax.Array,
+    *,
+    num_clusters: int,
+    max_points: int,
+) -> PointLists:
+    """Lists the points of each cluster.
 
     Args:
-      cluster: (N,) int32, in [0, num_clusters], the latter for none.
+      cluster: (E,) int32, in [0, num_clusters).
+      row: (E,) int32, of the point in `xy`.
+      num_entries: () int32; only the first so many entries count.
+      xy: (N, 2) float32, m.
       num_clusters: static, K.
       max_points: static, M.
 
     Returns:
-      index: (K, M) int32 rows of the points, in their order: all of them, or every (count / M)-th; N beyond.
-      count: (K,) int32, entries of the table, at most M.
+      The lists, each in the order of its entries.
     """
-    order, start = group_by(cluster, num_clusters)
-    total = jnp.diff(start)
-    j = jnp.arange(max_points)
 
-    def pick(rows: tuple[jax.Array, jax.Array]) -> jax.Array:
-        first, total = (a[:, None] for a in rows)
-        spread = j * (total // max_points) + j * (total % max_points) // max_points
-        offset = jnp.where(total > max_points, spread, j)
-        index = order[jnp.minimum(first + offset, cluster.shape[0] - 1)]
-        return jnp.where(j < total, index, cluster.shape[0])
+    def read(i: jax.Array) -> tuple[jax.Array, jax.Array]:
+        x, y = (values.at[row[i]].get(mode="promise_in_bounds") for values in columns)
+        return x, y
 
-    num_present = jnp.max(jnp.where(total > 0, jnp.arange(1, num_clusters + 1), 0), initial=0)
-    index = map_rows(pick, (start[:-1], total), num_rows=num_present, chunk=TABLE_CHUNK)
-    present = jnp.arange(num_clusters) < num_present
-    return jnp.where(present[:, None], index, cluster.shape[0]), jnp.minimum(total, max_points)
+    columns = xy[:, 0], xy[:, 1]
+    (x, y), begin, end = sort_by_group(read, cluster, num_entries, num_clusters)
+    return PointLists(x, y, begin, end - begin, max_points)
 
 
 def try_rotations(
-    points: jax.Array,
-    count: jax.Array,
+    points: PointLists,
+    cluster: jax.Array,
     num_clusters: jax.Array,
     *,
     criterion: str,
@@ -71,38 +115,56 @@ def try_rotations(
     variances of the distances to the nearest edges along u and along v (Zhang et al. 2017).
 
     Args:
-      points: (P, M, 2) float32, m, sensor frame.
-      count: (P,) int32, points of each cluster.
-      num_clusters: () int32, rows that hold a cluster.
+      points: of the clusters.
+      cluster: (P,) int32, the clusters to bound. Those of like size best lie side by side.
+      num_clusters: () int32, how many of them count.
       criterion: static, one of the above.
       num_angles: static, A; rotations by i * 90 / A degrees.
       min_distance_m: d0, m.
 
     Returns:
-      curve: (P, A) float32.
-      extents: four (P, A) float32, m: lower and upper bounds of u, then of v.
+      curve: (A, P) float32.
+      extents: four (A, P) float32, m: lower and upper bounds of u, then of v.
 
     Reference: paper, Algorithm III; oracles `jaxbox.reference.criterion_curve`, cv2.minAreaRect.
     """
-    angle = jnp.arange(num_angles) * (math.pi / 2 / num_angles)
-    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    angle = (np.arange(num_angles) * (math.pi / 2 / num_angles))[:, None]
+    cos, sin = jnp.asarray(np.cos(angle), jnp.float32), jnp.asarray(np.sin(angle), jnp.float32)
 
-    def rate(clusters: PointTable) -> tuple[jax.Array, Extents]:
-        extents = _extents(*clusters, cos, sin)
+    def rate(cluster: jax.Array) -> tuple[jax.Array, Extents]:
+        clusters = points.table(cluster)
+        extents = _extents(clusters, cos, sin)
         return _CRITERIA[criterion](clusters, cos, sin, extents, min_distance_m), extents
 
-    return map_rows(rate, (points, count), num_rows=num_clusters, chunk=CHUNK)
+    return map_rows(rate, cluster, num_rows=num_clusters, chunk=CHUNK, axis=-1)
 
 
-def _extents(points: jax.Array, count: jax.Array, cos: jax.Array, sin: jax.Array) -> Extents:
-    def update(state: Extents, x: jax.Array, y: jax.Array) -> Extents:
-        u, v = x * cos + y * sin, y * cos - x * sin
-        u0, u1, v0, v1 = state
-        return jnp.minimum(u0, u), jnp.maximum(u1, u), jnp.minimum(v0, v), jnp.maximum(v1, v)
+def _extents(clusters: PointTable, cos: jax.Array, sin: jax.Array) -> Extents:
+    # Of the four directions u, v, -u and -v, how far the cluster reaches: one kernel, and one array.
+    to_x, to_y = jnp.concatenate([cos, -sin, -cos, sin]), jnp.concatenate([sin, cos, -sin, -cos])
 
-    far = jnp.full((points.shape[0], cos.shape[0]), jnp.inf)
-    extents = fold_points(points, count, (far, -far, far, -far), update, twice=True)
-    return jax.tree.map(lambda e: jnp.where((count > 0)[:, None], e, 0), extents)
+    def update(reach: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+        return jnp.maximum(reach, _along(x, y, to_x, to_y))
+
+    x, y, count = clusters
+    # A point that is absent is seen as the first once more; a cluster without any has a first one anyhow.
+    nearest = jnp.full((to_x.shape[0], x.shape[1]), -jnp.inf)
+    reach = fold_points(x, y, count, nearest, update, absent=(x[0], y[0]))
+    u1, v1, u0, v0 = jnp.split(jnp.where(count > 0, reach, 0), 4)
+    return -u0, u1, -v0, v1
+
+
+def _along(x: jax.Array, y: jax.Array, to_x: jax.Array, to_y: jax.Array) -> jax.Array:
+    # Written alike wherever it is needed, so that it is rounded alike: the outermost point lies on the edge.
+    # (With the minus of -sin inside the loop it would be a difference, which rounds otherwise; and sines
+    # that are computed twice may differ.)
+    return x * to_x + y * to_y
+
+
+def _absent(num_angles: int) -> tuple[float, float]:
+    """A point far from all edges at all rotations: it lies between two of them."""
+    angle = math.pi / 4 / num_angles
+    return FAR_M * math.cos(angle), FAR_M * math.sin(angle)
 
 
 def _area(
@@ -118,9 +180,14 @@ def _closeness(
     u0, u1, v0, v1 = extents
 
     def distance(u: jax.Array, v: jax.Array) -> jax.Array:
-        return jnp.minimum(jnp.minimum(u - u0, u1 - u), jnp.minimum(v - v0, v1 - v))
+        return jnp.minimum(_to_edge(u, u0, u1), _to_edge(v, v0, v1))
 
     return _mean_closeness(clusters, cos, sin, distance, d0)
+
+
+def _to_edge(u: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """Distance to the nearer of two edges, from between them or beyond."""
+    return jnp.minimum(jnp.abs(u - low), jnp.abs(high - u))
 
 
 def _visible_closeness(
@@ -144,30 +211,35 @@ def _mean_closeness(
     distance: Callable[[jax.Array, jax.Array], jax.Array],
     d0: jax.Array | float,
 ) -> jax.Array:
-    def update(total: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-        return total + d0 / jnp.maximum(distance(x * cos + y * sin, y * cos - x * sin), d0)
+    minus_sin = -sin
 
-    points, count = clusters
-    zero = jnp.zeros((points.shape[0], cos.shape[0]))
-    return fold_points(points, count, zero, update) / jnp.maximum(count, 1)[:, None]
+    def update(total: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+        return total + d0 / jnp.maximum(distance(_along(x, y, cos, sin), _along(x, y, minus_sin, cos)), d0)
+
+    x, y, count = clusters
+    zero = jnp.zeros((cos.shape[0], x.shape[1]))
+    total = fold_points(x, y, count, zero, update, absent=_absent(cos.shape[0]))
+    return total / jnp.maximum(count, 1)
 
 
 def _variance(
     clusters: PointTable, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
 ) -> jax.Array:
     u0, u1, v0, v1 = extents
+    minus_sin = -sin
 
     def update(state: tuple[jax.Array, ...], x: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
-        u, v = x * cos + y * sin, y * cos - x * sin
-        du, dv = jnp.minimum(u - u0, u1 - u), jnp.minimum(v - v0, v1 - v)
-        along_u = du < dv
+        du, dv = _to_edge(_along(x, y, cos, sin), u0, u1), _to_edge(_along(x, y, minus_sin, cos), v0, v1)
+        there = jnp.abs(x) < FAR_M / 2
+        along_u = there & (du < dv)
+        along_v = there & ~along_u
         nu, su, ssu, nv, sv, ssv = state
-        du, dv = jnp.where(along_u, du, 0), jnp.where(along_u, 0, dv)
-        return nu + along_u, su + du, ssu + du**2, nv + ~along_u, sv + dv, ssv + dv**2
+        du, dv = jnp.where(along_u, du, 0), jnp.where(along_v, dv, 0)
+        return nu + along_u, su + du, ssu + du**2, nv + along_v, sv + dv, ssv + dv**2
 
-    points, count = clusters
-    zero = jnp.zeros((points.shape[0], cos.shape[0]))
-    nu, su, ssu, nv, sv, ssv = fold_points(points, count, (zero,) * 6, update)
+    x, y, count = clusters
+    zero = jnp.zeros((cos.shape[0], x.shape[1]))
+    nu, su, ssu, nv, sv, ssv = fold_points(x, y, count, (zero,) * 6, update, absent=_absent(cos.shape[0]))
 
     def spread(n: jax.Array, s: jax.Array, ss: jax.Array) -> jax.Array:
         n = jnp.maximum(n, 1)
@@ -190,7 +262,7 @@ def best_rectangles(
     """The rectangle at each cluster's best rotation.
 
     Args:
-      curve: (P, A) float32, see `try_rotations`.
+      curve: (A, P) float32, see `try_rotations`.
       extents: see `try_rotations`.
       preference: (A,) float32, added to every curve.
       insistence: how often the preference counts when the rotation is chosen; its worth counts it once.
@@ -198,14 +270,17 @@ def best_rectangles(
     Returns:
       The rectangles; of equally good rotations the first.
     """
-    total = curve + preference
-    best = jnp.argmax(curve + insistence * preference, axis=1)[:, None]
-    u0, u1, v0, v1 = (jnp.take_along_axis(e, best, axis=1)[:, 0] for e in extents)
+    num_angles = curve.shape[0]
+    total = curve + (insistence * preference)[:, None]
+    # An argmax does not vectorise (XLA, CPU).
+    is_best = total >= jnp.max(total, axis=0)
+    best = jnp.min(jnp.where(is_best, jnp.arange(num_angles)[:, None], num_angles - 1), axis=0)
+    u0, u1, v0, v1, worth = (jnp.take_along_axis(a, best[None], axis=0)[0] for a in (*extents, curve))
     return Rectangles(
-        angle=best[:, 0] * (math.pi / 2 / curve.shape[1]),
+        angle=best * (math.pi / 2 / num_angles),
         low=jnp.stack([u0, v0], axis=1),
         high=jnp.stack([u1, v1], axis=1),
-        worth=jnp.take_along_axis(total, best, axis=1)[:, 0],
+        worth=worth + preference[best],
     )
 
 

@@ -1,5 +1,6 @@
 """Correction for occluded vehicles: hidden sides are completed by the class prior, away from the sensor."""
 
+import dataclasses
 import math
 
 import jax
@@ -17,44 +18,68 @@ NEAR_M = 0.1
 FACE_OVERHANG_M = 0.3
 """Faces reach this far beyond their corners when points are held against them."""
 
+FAR_M = 1e9
+"""Farther away than any point."""
+
 NUM_PLACEMENTS = 3
 """Where a completed width goes: away from the sensor, towards it, or both ways."""
 
 SEEN_RAMP = 0.05
 """Fraction of the usual size over which a side goes from partly hidden to seen whole."""
 
+NUM_WAYS = 2
+"""Either side of a rectangle may be the length."""
+
 CERTAIN = 1e3
 """Objective of a box that was not held against evidence: it passes any gate on the objective."""
 
 
-def _sides(rectangle: Rectangles) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The two ways to call one side the length: low and high (P, 2 ways, 2 sides) and yaw (P, 2)."""
-    u0, v0 = rectangle.low[:, 0], rectangle.low[:, 1]
-    u1, v1 = rectangle.high[:, 0], rectangle.high[:, 1]
-    # With the length along v the frame turns by a quarter: across it lies -u.
-    low = jnp.stack([jnp.stack([u0, v0], 1), jnp.stack([v0, -u1], 1)], axis=1)
-    high = jnp.stack([jnp.stack([u1, v1], 1), jnp.stack([v1, -u0], 1)], axis=1)
-    yaw = jnp.stack([rectangle.angle, rectangle.angle + math.pi / 2], axis=1)
-    return low, high, yaw
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Ways:
+    """Rectangles, each with one of its sides taken as the length."""
+
+    along: tuple[jax.Array, jax.Array]
+    """(...) m: where the length begins and ends, along the box and from the sensor."""
+    across: tuple[jax.Array, jax.Array]
+    """(...) m: the same of the width, across the box."""
+    yaw: jax.Array
+    """(...) rad, not wrapped."""
+    worth: jax.Array
+    """(...) of the rectangle."""
+
+    @property
+    def measured(self) -> tuple[jax.Array, jax.Array]:
+        """(...) m: length and width."""
+        return self.along[1] - self.along[0], self.across[1] - self.across[0]
 
 
-def usual_sizes(rectangle: Rectangles, length_m: jax.Array, width_m: jax.Array) -> jax.Array:
-    """The class's size, or the measured where that is larger.
+def ways_to_lie(rectangle: Rectangles) -> Ways:
+    """The two ways to call one side the length.
 
     Args:
       rectangle: P rectangles.
-      length_m: (P,) float32, m, of the class.
-      width_m: (P,) float32, m, of the class.
 
     Returns:
-      (P, 2 ways, 2) float32, m: length and width, with either side as the length.
+      Ways (2, P).
     """
-    low, high, _ = _sides(rectangle)
-    return jnp.maximum(jnp.stack([length_m, width_m], axis=-1)[:, None], high - low)
+    (u0, v0), (u1, v1) = rectangle.low.T, rectangle.high.T
+    # With the length along v the frame turns by a quarter: across it lies -u.
+    ways = (
+        Ways((u0, u1), (v0, v1), rectangle.angle, rectangle.worth),
+        Ways((v0, v1), (-u1, -u0), rectangle.angle + math.pi / 2, rectangle.worth),
+    )
+    return jax.tree.map(lambda *of_way: jnp.stack(of_way), *ways)
+
+
+def fits(ways: Ways, max_length_m: jax.Array, max_width_m: jax.Array) -> jax.Array:
+    """(...) bool: whether the measured sides are no longer than those of the class."""
+    length, width = ways.measured
+    return (length <= max_length_m) & (width <= max_width_m)
 
 
 def likely_sizes(
-    rectangle: Rectangles,
+    ways: Ways,
     length_m: jax.Array,
     width_m: jax.Array,
     *,
@@ -63,13 +88,13 @@ def likely_sizes(
     seen_weight: jax.Array | float,
     length_margin_m: jax.Array | float,
     width_margin_m: jax.Array | float,
-) -> jax.Array:
+) -> tuple[jax.Array, jax.Array]:
     """The class's size for sides that may be hidden in part; between it and the measured for the others.
 
     Args:
-      rectangle: P rectangles.
-      length_m: (P,) float32, m, of the class.
-      width_m: (P,) float32, m, of the class.
+      ways: of any shape.
+      length_m: (...) float32, m, of the class.
+      width_m: (...) float32, m, of the class.
       seen_length: fraction of the class's length from which a side may be seen whole.
       seen_width: the same of its width.
       seen_weight: what the measured size of such a side weighs against the class's.
@@ -77,26 +102,39 @@ def likely_sizes(
       width_margin_m: measured widths read short by this, m.
 
     Returns:
-      (P, 2 ways, 2) float32, m: as `usual_sizes`; at least as measured.
+      Length and width (...) float32, m, at least as measured.
 
     Reference: oracle `jaxbox.reference.likely_size`.
     """
-    low, high, _ = _sides(rectangle)
-    measured = high - low
-    usual = jnp.stack([length_m, width_m], axis=-1)[:, None]
-    seen, margin = jnp.array([seen_length, seen_width]), jnp.array([length_margin_m, width_margin_m])
-    whole = jnp.clip((measured / usual - seen) / SEEN_RAMP, 0, 1)
-    return jnp.maximum(usual + seen_weight * whole * (measured + margin - usual), measured)
+
+    def likely(
+        measured: jax.Array, usual: jax.Array, seen: jax.Array | float, margin_m: jax.Array | float
+    ) -> jax.Array:
+        whole = jnp.clip((measured / usual - seen) / SEEN_RAMP, 0, 1)
+        return jnp.maximum(usual + seen_weight * whole * (measured + margin_m - usual), measured)
+
+    length, width = ways.measured
+    return (
+        likely(length, length_m, seen_length, length_margin_m),
+        likely(width, width_m, seen_width, width_margin_m),
+    )
 
 
-def _extend(low: jax.Array, high: jax.Array, size: jax.Array) -> jax.Array:
-    """Centres (..., 3) of an interval grown to `size`: from the near end, the far end, both."""
-    from_low, from_high, middle = low + size / 2, high - size / 2, (low + high) / 2
+def _extend(side: tuple[jax.Array, jax.Array], size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Centres of an interval grown to `size`: away from the sensor, towards it, both ways."""
+    low, high = side
+    from_low, from_high = low + size / 2, high - size / 2
     # The same as |low| < |high|, but right for a side without extent too: it grows away.
     low_is_near = low + high > 0
     away = jnp.where(low_is_near, from_low, from_high)
     towards = jnp.where(low_is_near, from_high, from_low)
-    return jnp.stack([away, towards, middle], axis=-1)
+    return away, towards, (low + high) / 2
+
+
+def _longer_side(rectangle: Rectangles) -> Ways:
+    first, second = (jax.tree.map(lambda a, i=i: a[i], ways_to_lie(rectangle)) for i in range(NUM_WAYS))
+    longer = second.measured[0] > first.measured[0]
+    return jax.tree.map(lambda a, b: jnp.where(longer, b, a), first, second)
 
 
 def keep_measured(rectangle: Rectangles, *, max_length_m: jax.Array, max_width_m: jax.Array) -> Boxes:
@@ -110,159 +148,192 @@ def keep_measured(rectangle: Rectangles, *, max_length_m: jax.Array, max_width_m
     Returns:
       Boxes (P,); no box where a measured side is too long.
     """
-    low, high, _ = _sides(rectangle)
-    return extend_away(rectangle, high - low, max_length_m=max_length_m, max_width_m=max_width_m)
+    way = _longer_side(rectangle)
+    certain = jnp.where(fits(way, max_length_m, max_width_m), CERTAIN, NOT_A_BOX)
+    return place(way, way.measured, jnp.zeros_like(certain, jnp.int32), certain)
 
 
 def extend_away(
-    rectangle: Rectangles, sizes: jax.Array, *, max_length_m: jax.Array, max_width_m: jax.Array
+    rectangle: Rectangles,
+    length_m: jax.Array,
+    width_m: jax.Array,
+    *,
+    max_length_m: jax.Array,
+    max_width_m: jax.Array,
+    **sides: jax.Array | float,
 ) -> Boxes:
-    """Completes both sides away from the sensor, the longer side as length.
+    """Completes both sides away from the sensor to their likely sizes, the longer side as length.
 
     The sensor sees the near ends of both sides; what is missing is behind them.
 
     Args:
       rectangle: P rectangles.
-      sizes: (P, 2 ways, 2) float32, m, see `likely_sizes`.
+      length_m: (P,) float32, m, of the class.
+      width_m: (P,) float32, m, of the class.
       max_length_m: (P,) float32, m.
       max_width_m: (P,) float32, m.
+      **sides: the other arguments of `likely_sizes`.
 
     Returns:
       Boxes (P,); no box where a measured side is too long.
     """
-    boxes = box_hypotheses(rectangle, sizes, max_length_m=max_length_m, max_width_m=max_width_m)
-    way = (boxes.measured[:, NUM_PLACEMENTS, 0] > boxes.measured[:, 0, 0]).astype(jnp.int32)
-    first = jax.tree.map(lambda a: a[jnp.arange(a.shape[0]), way * NUM_PLACEMENTS], boxes)
-    objective = jnp.where(first.objective > NOT_A_BOX, CERTAIN, NOT_A_BOX)
-    return Boxes(first.center, first.length, first.width, first.yaw, first.measured, objective)
+    way = _longer_side(rectangle)
+    certain = jnp.where(fits(way, max_length_m, max_width_m), CERTAIN, NOT_A_BOX)
+    sizes = likely_sizes(way, length_m, width_m, **sides)
+    return place(way, sizes, jnp.zeros_like(certain, jnp.int32), certain)
 
 
-def box_hypotheses(
-    rectangle: Rectangles, sizes: jax.Array, *, max_length_m: jax.Array, max_width_m: jax.Array
+def place(
+    ways: Ways, sizes: tuple[jax.Array, jax.Array], placement: jax.Array, objective: jax.Array
 ) -> Boxes:
-    """The vehicles that may hide behind each rectangle: which side is the length, where the width goes.
-
-    The length is completed away from the sensor; the width away from it, towards it, or both ways.
+    """Boxes of a size: the length away from the sensor, the width where `placement` says.
 
     Args:
-      rectangle: P rectangles.
-      sizes: (P, 2 ways, 2) float32, m, at least as measured: see `usual_sizes`, `likely_sizes`.
-      max_length_m: (P,) float32, m, longest measured length.
-      max_width_m: (P,) float32, m, widest measured width.
+      ways: Q of them.
+      sizes: length and width (Q,) float32, m, at least as measured.
+      placement: (Q,) int32, in [0, NUM_PLACEMENTS).
+      objective: (Q,) float32.
 
     Returns:
-      Boxes (P, 6) with objective 0, or `NOT_A_BOX` where a measured side is too long.
-
-    Reference: oracle `jaxbox.reference.complete_box`.
+      Boxes (Q,).
     """
-    low, high, yaw = _sides(rectangle)
-    centre_u = _extend(low[..., 0], high[..., 0], sizes[..., 0])
-    v = _extend(low[..., 1], high[..., 1], sizes[..., 1])
-    u = centre_u[..., :1]
-    cos, sin = jnp.cos(yaw)[..., None], jnp.sin(yaw)[..., None]
-    center = jnp.stack([cos * u - sin * v, sin * u + cos * v], axis=-1)
-    measured = high - low
-    fits = (measured[..., 0] <= max_length_m[:, None]) & (measured[..., 1] <= max_width_m[:, None])
-
-    def flat(a: jax.Array) -> jax.Array:
-        placed = jnp.broadcast_to(a[:, :, None], (a.shape[0], 2, NUM_PLACEMENTS, *a.shape[2:]))
-        return placed.reshape(a.shape[0], 2 * NUM_PLACEMENTS, *a.shape[2:])
-
+    u, across = _extend(ways.along, sizes[0])[0], _extend(ways.across, sizes[1])
+    v = jnp.select([placement == i for i in range(NUM_PLACEMENTS)], across)
+    cos, sin = jnp.cos(ways.yaw), jnp.sin(ways.yaw)
     return Boxes(
-        center=center.reshape(-1, 2 * NUM_PLACEMENTS, 2),
-        length=flat(sizes[..., 0]),
-        width=flat(sizes[..., 1]),
-        yaw=flat(yaw),
-        measured=flat(measured),
-        objective=jnp.where(flat(fits), 0, NOT_A_BOX),
+        center=jnp.stack([cos * u - sin * v, sin * u + cos * v], axis=-1),
+        length=sizes[0],
+        width=sizes[1],
+        yaw=ways.yaw,
+        measured=jnp.stack(ways.measured, axis=-1),
+        objective=objective,
     )
 
 
-def point_agreement(boxes: Boxes, points: jax.Array, count: jax.Array) -> tuple[jax.Array, jax.Array]:
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Hypotheses:
+    """The vehicles that may hide behind each way: the width goes away from the sensor, towards it, or both
+    ways."""
+
+    yaw: jax.Array
+    """(C,) rad"""
+    u: jax.Array
+    """(C,) m: centre along the box, from the sensor."""
+    v: jax.Array
+    """(3, C) m: centre across it."""
+    length: jax.Array
+    """(C,) m"""
+    width: jax.Array
+    """(C,) m"""
+
+    @property
+    def center(self) -> jax.Array:
+        """(3, C, 2) m, sensor frame."""
+        cos, sin = jnp.cos(self.yaw), jnp.sin(self.yaw)
+        return jnp.stack([cos * self.u - sin * self.v, sin * self.u + cos * self.v], axis=-1)
+
+
+def hypotheses(ways: Ways, length_m: jax.Array, width_m: jax.Array) -> Hypotheses:
+    """Completes boxes to the class's size, or the measured where that is larger.
+
+    Args:
+      ways: C of them.
+      length_m: (C,) float32, m, of the class.
+      width_m: (C,) float32, m, of the class.
+
+    Returns:
+      The hypotheses: the length is completed away from the sensor.
+
+    Reference: oracle `jaxbox.reference.complete_box`.
+    """
+    length, width = (jnp.maximum(a, b) for a, b in zip((length_m, width_m), ways.measured, strict=True))
+    return Hypotheses(
+        yaw=ways.yaw,
+        u=_extend(ways.along, length)[0],
+        v=jnp.stack(_extend(ways.across, width)),
+        length=length,
+        width=width,
+    )
+
+
+def point_agreement(
+    boxes: Hypotheses,
+    x: jax.Array,
+    y: jax.Array,
+    count: jax.Array,
+    *,
+    inside_weight: jax.Array | float,
+    near_weight: jax.Array | float,
+) -> jax.Array:
     """How well boxes hold the points they were made from, and how close these are to visible faces.
 
     Args:
-      boxes: (P, S) hypotheses.
-      points: (P, M, 2) float32, m.
-      count: (P,) int32, points of each.
+      boxes: C times three hypotheses.
+      x: (M, C) float32, m.
+      y: (M, C) float32, m.
+      count: (C,) int32, points of each.
+      inside_weight: of the fraction of the points inside the box, give or take 10 cm.
+      near_weight: of the mean of .1 / max(d, .1), d the distance to the nearest visible face.
 
     Returns:
-      inside: (P, S) float32 in [0, 1]: fraction of the points inside the box, give or take 10 cm.
-      near: (P, S) float32 in [0, 1]: mean of .1 / max(d, .1), d the distance to the nearest visible face.
+      (3, C) float32: the weighted sum of both.
     """
-    cos, sin = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw)
-    x0, y0 = boxes.center[..., 0], boxes.center[..., 1]
     half_l, half_w = boxes.length / 2, boxes.width / 2
-    # The sensor at the origin, in the box's frame: it sees the faces on its side of the box.
-    sensor_u, sensor_v = -(x0 * cos + y0 * sin), x0 * sin - y0 * cos
-    face_u = jnp.where(sensor_u > 0, half_l, -half_l)
-    face_v = jnp.where(sensor_v > 0, half_w, -half_w)
-    sees_u, sees_v = jnp.abs(sensor_u) > half_l, jnp.abs(sensor_v) > half_w
+    # The sensor, at the origin, sees the faces on its side of the box; the others are far from all points.
+    face_u = jnp.where(jnp.abs(boxes.u) > half_l, -jnp.sign(boxes.u) * half_l, FAR_M)
+    face_v = jnp.where(jnp.abs(boxes.v) > half_w, -jnp.sign(boxes.v) * half_w, FAR_M)
 
-    def update(state: tuple[jax.Array, jax.Array], x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array]:
-        u, v = (x - x0) * cos + (y - y0) * sin, (y - y0) * cos - (x - x0) * sin
+    cos, sin = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw)
+
+    def update(total: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
+        u, v = x * cos + y * sin - boxes.u, y * cos - x * sin - boxes.v
         out_u, out_v = jnp.abs(u) - half_l, jnp.abs(v) - half_w
         inside = (out_u < INSIDE_MARGIN_M) & (out_v < INSIDE_MARGIN_M)
-        to_u = jnp.where(sees_u & (out_v < FACE_OVERHANG_M), jnp.abs(u - face_u), jnp.inf)
-        to_v = jnp.where(sees_v & (out_u < FACE_OVERHANG_M), jnp.abs(v - face_v), jnp.inf)
+        to_u = jnp.where(out_v < FACE_OVERHANG_M, jnp.abs(u - face_u), FAR_M)
+        to_v = jnp.where(out_u < FACE_OVERHANG_M, jnp.abs(v - face_v), FAR_M)
         near = NEAR_M / jnp.maximum(jnp.minimum(to_u, to_v), NEAR_M)
-        return state[0] + inside, state[1] + near
+        return total + inside_weight * inside + near_weight * near
 
-    zero = jnp.zeros_like(boxes.yaw)
-    inside, near = fold_points(points, count, (zero, zero), update)
-    total = jnp.maximum(count, 1)[:, None]
-    return inside / total, near / total
+    # Points that are absent are far from all boxes.
+    total = fold_points(x, y, count, jnp.zeros_like(boxes.v), update, absent=(FAR_M, FAR_M))
+    return total / jnp.maximum(count, 1)
 
 
-def choose_hypothesis(
-    boxes: Boxes,
-    likely: Boxes,
+def choose_placement(
     worth: jax.Array,
+    agreement: jax.Array,
     *,
     hit: jax.Array,
     free: jax.Array,
     free_length: jax.Array,
-    inside: jax.Array,
-    near: jax.Array,
     free_weight: jax.Array | float,
     free_length_weight: jax.Array | float,
-    inside_weight: jax.Array | float,
-    near_weight: jax.Array | float,
     closeness_weight: jax.Array | float,
     not_away_cost: jax.Array | float,
-) -> Boxes:
-    """The hypothesis that explains the evidence best.
+) -> tuple[jax.Array, jax.Array]:
+    """The hypothesis of each way that explains the evidence best.
 
-    J = hit - wf free - wl free_length + wi inside + wn near + wc worth - cost [width not away].
+    J = hit - wf free - wl free_length + agreement + wc worth - cost [width not away].
 
     Args:
-      boxes: (P, S) hypotheses, see `box_hypotheses`, as the evidence judges them: a box of the class's
-        size asks more of it.
-      likely: (P, S) the same at their likely sizes, which are answered.
-      worth: (P, S) float32, of the rectangle.
-      hit: (P, S) float32, fraction of rays.
-      free: (P, S) float32, fraction of rays.
-      free_length: (P, S) float32, fraction of the rays' length.
-      inside: (P, S) float32, fraction of points.
-      near: (P, S) float32, closeness to visible faces.
+      worth: (C,) float32, of the rectangle.
+      agreement: (3, C) float32, see `point_agreement`.
+      hit: (3, C) float32, fraction of rays.
+      free: (3, C) float32, fraction of rays.
+      free_length: (3, C) float32, fraction of the rays' length.
       free_weight: wf.
       free_length_weight: wl.
-      inside_weight: wi.
-      near_weight: wn.
       closeness_weight: wc.
       not_away_cost: cost.
 
     Returns:
-      Boxes (P,) with their J; `NOT_A_BOX` where no hypothesis is left.
+      Its placement (C,) int32, the first of equally good ones, and its J (C,) float32.
     """
-    placement = jnp.arange(boxes.yaw.shape[1]) % NUM_PLACEMENTS
-    objective = hit - free_weight * free - free_length_weight * free_length
-    objective = objective + inside_weight * inside + near_weight * near
-    objective = objective + closeness_weight * worth - not_away_cost * (placement > 0)
-    objective = jnp.where(boxes.objective > NOT_A_BOX, objective, NOT_A_BOX)
-    best = jnp.argmax(objective, axis=1)
-    rows = jnp.arange(best.shape[0])
-    chosen = jax.tree.map(lambda a: a[rows, best], likely)
-    return Boxes(
-        chosen.center, chosen.length, chosen.width, chosen.yaw, chosen.measured, objective[rows, best]
-    )
+    cost = not_away_cost * (jnp.arange(NUM_PLACEMENTS) > 0)[:, None]
+    objective = hit - free_weight * free - free_length_weight * free_length + agreement
+    objective = objective + closeness_weight * worth - cost
+    best = jnp.max(objective, axis=0)
+    # An argmax does not vectorise (XLA, CPU).
+    placement = jnp.where(objective >= best, jnp.arange(NUM_PLACEMENTS)[:, None], NUM_PLACEMENTS)
+    return jnp.min(placement, axis=0), best

@@ -25,7 +25,8 @@ FREE_AFTER_M, FREE_BEFORE_M = 0.3, 0.2
 DEEP_BEYOND_M = 0.1
 """A return later than a hit, up to this past the exit, is a deep one: through a window, say."""
 
-BLOCK = 16
+BLOCK_BITS = 4
+BLOCK = 2**BLOCK_BITS
 """Range cells of one word of the evidence: a bit of its low half each; the high half tells of the others."""
 
 NEVER = 2**BLOCK - 1
@@ -196,7 +197,7 @@ def azimuth_cell(azimuth: jax.Array, num_azimuths: int) -> jax.Array:
 
 def _free_words(beams: jax.Array) -> jax.Array:
     """From how many more beams begin than end in each cell (B, 16, A), what `Evidence.free` holds."""
-    running = _sum_before(sum(beams[:, k] for k in range(BLOCK)))
+    running = _sum_before(functools.reduce(jnp.add, (beams[:, k] for k in range(BLOCK))))
     free = jnp.zeros_like(running, jnp.uint32)
     for k in range(BLOCK):
         running = running + beams[:, k]
@@ -254,7 +255,8 @@ def _ground_support(
     for axis in (0, 1):
         pad = [(SUPPORT_REACH, SUPPORT_REACH) if a == axis else (0, 0) for a in (0, 1)]
         padded = jnp.pad(count, pad)
-        count = sum(jax.lax.slice_in_dim(padded, k, k + n, axis=axis) for k in range(2 * SUPPORT_REACH + 1))
+        slices = (jax.lax.slice_in_dim(padded, k, k + n, axis=axis) for k in range(2 * SUPPORT_REACH + 1))
+        count = functools.reduce(jnp.add, slices)
     return count.astype(jnp.float32)
 
 
@@ -291,9 +293,9 @@ def cast_rays(
     Args:
       evidence: of the sweep.
       center: (..., 2) float32, m.
-      length: (...) float32, m.
-      width: (...) float32, m.
-      yaw: (...) float32, rad.
+      length: float32, m, broadcasts to (...).
+      width: likewise.
+      yaw: likewise, rad.
       num_rays: static.
       range_cell_m: static, as the evidence was built with.
 
@@ -302,11 +304,13 @@ def cast_rays(
 
     Reference: oracle `jaxbox.reference.box_evidence`.
     """
-    shape = length.shape
-    length, width, yaw = (a.reshape(-1) for a in (length, width, yaw))
+    shape = center.shape[:-1]
     there = jnp.any(length >= 0)
-    rays = store(_ray_stretches(center.reshape(-1, 2), length, width, yaw, num_rays), there)
-    met = store(_sort_rays(evidence, *rays, range_cell_m, there), there)
+    length, width, yaw = (jnp.broadcast_to(a, shape).reshape(-1) for a in (length, width, yaw))
+    # Stored, or what is the same for all rays of a box would be worked out for each.
+    fan = store(_ray_fan(center.reshape(-1, 2), length / 2, width / 2, yaw), there)
+    azimuth, enter, leave = store(_ray_stretches(fan, num_rays), there)
+    met = store(_sort_rays(evidence, azimuth, enter, leave, range_cell_m, there), there)
     hit, free, deep, crosses, free_cells, cells = (jnp.sum(a, axis=0).reshape(shape) for a in met)
     total = jnp.maximum(crosses, 1)
     return RayFractions(
@@ -318,32 +322,37 @@ def cast_rays(
     )
 
 
-def _ray_stretches(
-    center: jax.Array, length: jax.Array, width: jax.Array, yaw: jax.Array, num_rays: int
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Azimuth of rays over boxes, and the ranges at which they enter and leave, each (num_rays, boxes).
+Fan = tuple[jax.Array, ...]
+"""Azimuth of the middle ray over each box and half the angle between the outer ones, rad; direction of the
+middle ray, the box's centre from the sensor, m, and half its size, m, all three along and across the box."""
 
-    In the box's frame, with the sensor at the origin, the box is |u - u0| < length / 2 and
-    |v - v0| < width / 2: the slab test. A ray that leaves before it enters misses.
-    """
+
+def _ray_fan(center: jax.Array, half_l: jax.Array, half_w: jax.Array, yaw: jax.Array) -> Fan:
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     x, y = center[:, 0], center[:, 1]
-    u0, v0 = x * cos + y * sin, y * cos - x * sin
-    rho = jnp.maximum(jnp.sqrt(x**2 + y**2), 1e-6)
-    # The corners' azimuths, from that of the middle on.
-    corners = [(u0 + a * length / 2, v0 + b * width / 2) for a in (-1, 1) for b in (-1, 1)]
-    spread = [_arctan2(u0 * v - v0 * u, u0 * u + v0 * v) for u, v in corners]
+    u, v = x * cos + y * sin, y * cos - x * sin
+    # The azimuths of the corners, from that of the centre on.
+    corners = [(u + a * half_l, v + b * half_w) for a in (-1, 1) for b in (-1, 1)]
+    spread = [_arctan2(u * cv - v * cu, u * cu + v * cv) for cu, cv in corners]
     low, high = functools.reduce(jnp.minimum, spread), functools.reduce(jnp.maximum, spread)
-    middle, half = (low + high) / 2, (high - low) / 2
-    turn, tilt = jnp.cos(middle), jnp.sin(middle)
-    along, across = (u0 * turn - v0 * tilt) / rho, (v0 * turn + u0 * tilt) / rho
-    # Half a turn at most, as seen from outside the box: from inside, any direction leads out.
+    azimuth = _arctan2(y, x) + (low + high) / 2
+    along, across = jnp.cos(azimuth - yaw), jnp.sin(azimuth - yaw)
+    return azimuth, (high - low) / 2, along, across, u, v, half_l, half_w
+
+
+def _ray_stretches(fan: Fan, num_rays: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Azimuth of rays over boxes, and the ranges at which they enter and leave, each (num_rays, boxes).
+
+    In the box's frame, with the sensor at the origin, the box is |u - u0| < l / 2 and |v - v0| < w / 2: the
+    slab test. A ray that leaves before it enters misses.
+    """
+    middle, half, along, across, u0, v0, half_l, half_w = fan
+    # A quarter turn at most, as seen from outside the box; from inside, any direction leads out.
     offset = ((2 * jnp.arange(num_rays) + 1) / num_rays - 1)[:, None] * half
     cos, sin = _cos_sin(offset)
-    enter_u, leave_u = _slab(u0, along * cos - across * sin, length / 2)
-    enter_v, leave_v = _slab(v0, across * cos + along * sin, width / 2)
-    azimuth = _arctan2(y, x) + middle + offset
-    return azimuth, jnp.maximum(enter_u, enter_v), jnp.minimum(leave_u, leave_v)
+    enter_u, leave_u = _slab(u0, along * cos - across * sin, half_l)
+    enter_v, leave_v = _slab(v0, across * cos + along * sin, half_w)
+    return middle + offset, jnp.maximum(enter_u, enter_v), jnp.minimum(leave_u, leave_v)
 
 
 def _cos_sin(angle: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -362,8 +371,8 @@ def _polynomial(coefficients: tuple[float, ...], x: jax.Array) -> jax.Array:
 def _slab(middle: jax.Array, direction: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
     # A ray along the face: any tiny slope has it wholly within, or wholly outside, the slab.
     inverse = 1 / jnp.where(jnp.abs(direction) > MIN_SLOPE, direction, MIN_SLOPE)
-    a, b = (middle - half) * inverse, (middle + half) * inverse
-    return jnp.minimum(a, b), jnp.maximum(a, b)
+    through, reach = middle * inverse, half * jnp.abs(inverse)
+    return through - reach, through + reach
 
 
 def _sort_rays(
@@ -392,7 +401,7 @@ def _sort_rays(
         lookup(table.reshape(-1), place)
         for table, place in zip(
             (evidence.hit, evidence.free, evidence.free),
-            store([end // BLOCK * num_azimuths + column for end in ends], there),
+            store([(end >> BLOCK_BITS) * num_azimuths + column for end in ends], there),
             strict=True,
         )
     )
@@ -407,12 +416,12 @@ def _sort_rays(
 
 def _next_hit(word: jax.Array, cell: jax.Array) -> jax.Array:
     """Range cell of the first hit in a cell or beyond, from the word of its block in `Evidence.hit`."""
-    bit = (cell % BLOCK).astype(jnp.uint32)
+    bit = (cell & (BLOCK - 1)).astype(jnp.uint32)
     rest = (word & NEVER) >> bit
     return jnp.where(rest > 0, cell + _lowest_bit(rest).astype(jnp.int32), (word >> BLOCK).astype(jnp.int32))
 
 
 def _free_before(word: jax.Array, cell: jax.Array) -> jax.Array:
     """How many cells before one are free, from the word of its block in `Evidence.free`."""
-    below = (jnp.uint32(1) << (cell % BLOCK).astype(jnp.uint32)) - 1
+    below = (jnp.uint32(1) << (cell & (BLOCK - 1)).astype(jnp.uint32)) - 1
     return ((word >> BLOCK) + jax.lax.population_count(word & below)).astype(jnp.int32)

@@ -20,7 +20,7 @@ WORD_BITS = 32
 SORT_STEPS = 4
 """Sorts are as long as what is there, in so many steps."""
 
-FOLD_UNROLL = 2
+FOLD_UNROLL = 4
 """Points folded in one step of the loop over them."""
 
 
@@ -49,8 +49,7 @@ def _count_before(mask: jax.Array) -> jax.Array:
     """(N,) prefix sum of truth values, as the bits of words: a sum over words, and bits counted in one."""
     size = mask.shape[0]
     bit = jnp.arange(WORD_BITS, dtype=jnp.uint32)
-    bits = jnp.pad(mask, (0, -size % WORD_BITS)).reshape(-1, WORD_BITS)
-    words = jnp.sum(jnp.where(bits, jnp.uint32(1) << bit, jnp.uint32(0)), axis=1, dtype=jnp.uint32)
+    words = _words(mask)
     population = jax.lax.population_count(words).astype(jnp.int32)
     before = prefix_sum(population) - population
     up_to = (jnp.uint32(2) << bit) - 1
@@ -72,12 +71,47 @@ def compact(mask: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
     >>> compact(jnp.array([False, True, True]), 4)[0].tolist()
     [1, 2, 3, 3]
     """
+    return jax.lax.platform_dependent(
+        mask,
+        cpu=functools.partial(_compact_one_by_one, capacity=capacity),
+        default=functools.partial(_compact_at_once, capacity=capacity),
+    )
+
+
+def _compact_at_once(mask: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.Array]:
     size = mask.shape[0]
     order = prefix_sum(mask)
     target = jnp.where(mask, order - 1, capacity)
     index = jnp.full(capacity, size, jnp.int32)
     index = index.at[target].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
     return index, order[-1]
+
+
+def _compact_one_by_one(mask: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.Array]:
+    """Bit after bit of words of flags: XLA compiles so small a loop to native code on the CPU."""
+    words = _words(mask)
+
+    def of_word(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        def of_bit(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+            word, index, count = state
+            lowest = jax.lax.population_count((word & -word) - 1).astype(jnp.int32)
+            index = index.at[jnp.minimum(count, capacity)].set(i * WORD_BITS + lowest)
+            return word & (word - 1), index, count + 1
+
+        _, index, count = jax.lax.while_loop(lambda state: state[0] > 0, of_bit, (words[i], *state))
+        return index, count
+
+    # One entry more takes what is beyond the capacity.
+    index = jnp.full(capacity + 1, mask.shape[0], jnp.int32)
+    index, count = jax.lax.fori_loop(0, words.shape[0], of_word, (index, jnp.int32(0)))
+    return index[:capacity], count
+
+
+def _words(mask: jax.Array) -> jax.Array:
+    """(W,) uint32: the flags as the bits of words."""
+    bits = jnp.pad(mask, (0, -mask.shape[0] % WORD_BITS)).reshape(-1, WORD_BITS)
+    bit = jnp.arange(WORD_BITS, dtype=jnp.uint32)
+    return jnp.sum(jnp.where(bits, jnp.uint32(1) << bit, jnp.uint32(0)), axis=1, dtype=jnp.uint32)
 
 
 def take(rows: jax.Array, index: jax.Array, fill: Any = 0) -> jax.Array:
@@ -206,7 +240,9 @@ def masked_std(values: jax.Array, mask: jax.Array) -> jax.Array:
     return jnp.sqrt(masked_mean(centred**2, mask))
 
 
-def map_rows(function: Callable[[Any], Any], rows: Any, *, num_rows: jax.Array, chunk: int) -> Any:
+def map_rows(
+    function: Callable[[Any], Any], rows: Any, *, num_rows: jax.Array, chunk: int, axis: int = 0
+) -> Any:
     """Applies a batched function to the first `num_rows` rows, a chunk at a time.
 
     Work is proportional to the rows that are there, not to the capacity, and what a chunk needs
@@ -217,26 +253,37 @@ def map_rows(function: Callable[[Any], Any], rows: Any, *, num_rows: jax.Array, 
       rows: pytree of (P, ...) arrays.
       num_rows: () int32, how many rows count.
       chunk: static, rows at a time.
+      axis: static, 0 or -1: the axis of all arrays along which the rows lie; -1 for (..., P) arrays.
 
     Returns:
       Pytree of (P, ...) arrays; rows of chunks beyond `num_rows` are zero.
     """
-    capacity = jax.tree.leaves(rows)[0].shape[0]
-    padded = jax.tree.map(lambda a: jnp.pad(a, [(0, -capacity % chunk)] + [(0, 0)] * (a.ndim - 1)), rows)
+    capacity = jax.tree.leaves(rows)[0].shape[axis]
+    missing = -capacity % chunk
+
+    def extended(a: jax.Array) -> jax.Array:
+        width = [(0, 0)] * a.ndim
+        width[axis] = (0, missing)
+        return jnp.pad(a, width)
+
+    padded = jax.tree.map(extended, rows)
 
     def part(i: jax.Array) -> Any:
-        return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, i * chunk, chunk), padded)
+        return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, i * chunk, chunk, axis), padded)
 
     def step(i: jax.Array, out: Any) -> Any:
         new = function(part(i))
-        return jax.tree.map(lambda o, n: jax.lax.dynamic_update_slice_in_dim(o, n, i * chunk, 0), out, new)
+        return jax.tree.map(lambda o, n: jax.lax.dynamic_update_slice_in_dim(o, n, i * chunk, axis), out, new)
 
-    shapes = jax.eval_shape(function, jax.eval_shape(part, 0))
-    size = capacity + -capacity % chunk
-    out = jax.tree.map(lambda s: jnp.zeros((size, *s.shape[1:]), s.dtype), shapes)
+    def empty(shape: jax.ShapeDtypeStruct) -> jax.Array:
+        size = list(shape.shape)
+        size[axis] = capacity + missing
+        return jnp.zeros(size, shape.dtype)
+
+    out = jax.tree.map(empty, jax.eval_shape(function, jax.eval_shape(part, 0)))
     num_chunks = (jnp.minimum(num_rows, capacity) + chunk - 1) // chunk
     out = jax.lax.fori_loop(0, num_chunks, step, out)
-    return jax.tree.map(lambda a: a[:capacity], out)
+    return jax.tree.map(lambda a: jax.lax.slice_in_dim(a, 0, capacity, axis=axis), out)
 
 
 def fold_rows(
@@ -418,44 +465,48 @@ def _sort_present(words: jax.Array, present: jax.Array) -> jax.Array:
 
 
 def fold_points(
-    points: jax.Array,
+    x: jax.Array,
+    y: jax.Array,
     count: jax.Array,
     init: Any,
     update: Callable[[Any, jax.Array, jax.Array], Any],
     *,
-    twice: bool = False,
+    absent: tuple[Any, Any],
 ) -> Any:
-    """Folds the points of many clusters into a wide state, one point of each cluster at a time.
+    """Folds the points of many clusters into a wide state, a few points of each cluster at a time.
 
-    A loop over points with a wide carry vectorises; a reduction over an inner axis does not (XLA, CPU).
-    The loop ends with the largest cluster of the batch.
+    With the clusters along the last axis all arithmetic vectorises, which a reduction over an inner axis
+    does not (XLA, CPU). The loop ends with the largest cluster of the batch.
 
     Args:
-      points: (C, M, 2) float32.
+      x: (M, C) float32.
+      y: (M, C) float32.
       count: (C,) int32, points of each cluster.
-      init: pytree of (C, ...) arrays, the state before the first point.
-      update: maps the state and x (C, 1), y (C, 1) to the next state.
-      twice: static, whether a point may be seen more than once, as when their bounds are sought: a
-        cluster that is through sees its first point again, which costs less than to leave it alone. A
-        cluster without points sees one too, anything finite.
+      init: pytree of (..., C) arrays, the state before the first point.
+      update: maps the state and x (C,), y (C,) to the next state.
+      absent: x and y, () or (C,) each, of the points that a cluster does not have: such that `update`
+        makes nothing of them.
 
     Returns:
       The state after the last point of each cluster.
     """
-    capacity = points.shape[1]
-    by_point = jnp.swapaxes(jnp.pad(points, [(0, 0), (0, -capacity % FOLD_UNROLL), (0, 0)]), 0, 1)
-    if twice:
-        there = jnp.arange(by_point.shape[0])[:, None] < jnp.minimum(count, capacity)
-        by_point = jnp.where(there[..., None], by_point, by_point[:1])
+    capacity = x.shape[0]
+    there = jnp.arange(capacity)[:, None] < count
 
-    def step(i: jax.Array, state: Any) -> Any:
+    def fill(values: jax.Array, value: Any) -> jax.Array:
+        filled = jnp.where(there, values, value)
+        more = jnp.broadcast_to(value, (-capacity % FOLD_UNROLL, values.shape[1]))
+        return jnp.concatenate([filled, more])
+
+    filled = fill(x, absent[0]), fill(y, absent[1])
+
+    most = jnp.minimum(jnp.max(count, initial=0), capacity)
+
+    def step(loop: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        first, state = loop
+        # A point by its own index: a slice of several is ten times slower (XLA, CPU).
         for k in range(FOLD_UNROLL):
-            m = FOLD_UNROLL * i + k
-            xy = by_point[m]
-            new = update(state, xy[:, :1], xy[:, 1:])
-            there = (m < jnp.minimum(count, capacity))[:, None]
-            state = new if twice else jax.tree.map(lambda n, o, t=there: jnp.where(t, n, o), new, state)
-        return state
+            state = update(state, filled[0][first + k], filled[1][first + k])
+        return first + FOLD_UNROLL, state
 
-    most = jnp.minimum(jnp.max(count), capacity)
-    return jax.lax.fori_loop(0, (most + FOLD_UNROLL - 1) // FOLD_UNROLL, step, init)
+    return jax.lax.while_loop(lambda loop: loop[0] < most, step, (jnp.int32(0), init))[1]

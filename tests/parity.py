@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbox import reference, synthetic
+from jaxbox.box import PointLists
 from jaxbox.config import ComponentMap, DetectorConfig
 from jaxbox.evidence import BLOCK, Evidence, _free_words, _hit_words
 from jaxbox.reference.proposals import (
@@ -206,6 +207,13 @@ def padded_points(cases):
     for row, xy in zip(points, clusters, strict=True):
         row[: len(xy)] = xy
     return points, np.array([len(xy) for xy in clusters], np.int32)
+
+
+def point_lists(points, count):
+    """The same points as the compiled stages take them."""
+    size, most = points.shape[:2]
+    x, y = jnp.asarray(points).reshape(-1, 2).T
+    return PointLists(x, y, jnp.arange(size) * most, jnp.asarray(count), most)
 
 
 def assert_share(bad, total, limit, what):

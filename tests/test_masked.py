@@ -112,6 +112,12 @@ def test_map_rows_equals_the_function_on_all_rows_and_zero_beyond_the_last_chunk
         np.testing.assert_array_equal(large, done & (values > 3))
 
 
+def test_map_rows_maps_along_the_last_axis_too():
+    values = jnp.arange(20.0).reshape(2, 10)
+    mapped = masked.map_rows(lambda v: 2 * v, values, num_rows=jnp.int32(5), chunk=4, axis=-1)
+    np.testing.assert_array_equal(mapped, jnp.where(jnp.arange(10) < 8, 2 * values, 0))
+
+
 def grouped(group, num_groups):
     order, start = group_by(np.asarray(group, np.int32), num_groups)
     return np.asarray(order), np.asarray(start)
@@ -164,19 +170,32 @@ def test_group_by_of_one_group_or_none_keeps_the_order(all_in):
 
 
 def test_fold_points_sees_each_point_of_each_cluster_once_and_in_order():
-    points = np.random.default_rng(4).normal(size=(3, 6, 2)).astype(np.float32)
+    x, y = np.random.default_rng(4).normal(size=(2, 6, 3)).astype(np.float32)
 
     def update(state, x, y):
         total, last = state
-        return total + jnp.concatenate([x, y], axis=1), jnp.broadcast_to(x, last.shape)
+        there = x < 9
+        return total + jnp.where(there, jnp.stack([x, y]), 0), jnp.where(there, x, last)
 
-    fold = jax.jit(lambda counts: masked.fold_points(jnp.asarray(points), counts, init, update))
-    init = jnp.zeros((3, 2)), jnp.full((3, 1), 7.0)
+    fold = jax.jit(lambda counts: masked.fold_points(x, y, counts, init, update, absent=(9.0, jnp.zeros(3))))
+    init = jnp.zeros((2, 3)), jnp.full(3, 7.0)
     for counts in ([0, 0, 0], [1, 0, 6], [6, 6, 6], [2, 9, 3]):
         total, last = fold(jnp.array(counts))
         for cluster, count in enumerate(np.minimum(counts, 6)):
-            np.testing.assert_allclose(total[cluster], points[cluster, :count].sum(axis=0), atol=1e-5)
-            assert float(last[cluster, 0]) == (points[cluster, count - 1, 0] if count else 7.0)
+            expected = np.stack([x, y])[:, :count, cluster].sum(axis=1)
+            np.testing.assert_allclose(total[:, cluster], expected, atol=1e-5)
+            assert float(last[cluster]) == (x[count - 1, cluster] if count else 7.0)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 1.0])
+@pytest.mark.parametrize("capacity", [1, 300, 2000])
+def test_both_ways_to_compact_give_the_same(share, capacity):
+    for size in (1, 31, 32, 1000):
+        mask = jnp.asarray(np.random.default_rng(size).random(size) < share)
+        ways = masked._compact_one_by_one, masked._compact_at_once
+        one, other = (way(mask, capacity=capacity) for way in ways)
+        np.testing.assert_array_equal(one[0], other[0])
+        assert int(one[1]) == int(other[1]) == int(mask.sum())
 
 
 def test_the_toolbox_gives_the_same_under_jit_and_vmap():

@@ -139,7 +139,8 @@ def test_extreme_points_lose_at_most_a_slice_of_the_hull(cases):
 
 def fits_of(cases):
     points, count = parity.padded_points(cases)
-    return points, count, (parity.pad(points, MAX_FITS), parity.pad(count, MAX_FITS), np.int32(len(count)))
+    lists = parity.point_lists(parity.pad(points, MAX_FITS), parity.pad(count, MAX_FITS))
+    return points, count, (lists, jnp.arange(MAX_FITS), np.int32(len(count)))
 
 
 @pytest.mark.parametrize("criterion", CRITERIA)
@@ -150,7 +151,7 @@ def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, cr
     rectangles = jax.tree.map(
         np.asarray, box.best_rectangles(curves, extents, jnp.zeros(SETTINGS.num_angles))
     )
-    curves, extents = np.asarray(curves), np.stack(extents, axis=-1)
+    curves, extents = np.asarray(curves).T, np.stack(extents).transpose(2, 1, 0)
     angles = np.round(rectangles.angle / (math.pi / 2 / SETTINGS.num_angles)).astype(int)
     wrong = worse = 0
     for k in range(len(count)):
@@ -173,7 +174,7 @@ def test_smallest_area_is_that_of_opencv_within_the_bound_of_the_step(cases):
     step = math.pi / 2 / SETTINGS.num_angles
     for k in range(len(count)):
         _, (length, width), _ = reference.min_area_rectangle(points[k, : count[k]])
-        area = -float(np.max(curve[k]))
+        area = -float(np.max(curve[:, k]))
         # Turned by half a step off the best, l w grows to at most l w + (l^2 + w^2) / 2 sin(step).
         bound = (length**2 + width**2) / 2 * math.sin(step)
         assert length * width - 1e-3 <= area <= length * width + bound + 1e-3

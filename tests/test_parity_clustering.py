@@ -34,7 +34,7 @@ def select_clusters(component, xy, height, in_slab, first, *, max_clusters, **ga
     return clustering.select_clusters(statistics, first, max_clusters=max_clusters, **gates)
 
 
-sample_points = jax.jit(box.sample_points, static_argnames=("num_clusters", "max_points"))
+list_points = jax.jit(box.list_points, static_argnames=("num_clusters", "max_points"))
 
 
 def cell_options(component_map: ComponentMap):
@@ -210,15 +210,19 @@ def test_fitted_points_are_exactly_those_of_the_reference(cases):
         few = np.bincount(case.slot[in_slab & (case.slot >= 0)], minlength=len(case.proposals))
         few = few < settings.min_slab_points
         used = (case.slot >= 0) & (in_slab | few[case.slot])
-        index, count = sample_points(
-            parity.pad(
-                np.where(used, case.slot, parity.MAX_CLUSTERS), parity.MAX_OBSTACLES, parity.MAX_CLUSTERS
-            ),
+        xy = case.obstacles.xyz[:, :2].astype(np.float32)
+        rows = np.flatnonzero(used)
+        lists = list_points(
+            parity.pad(case.slot[rows], parity.MAX_OBSTACLES),
+            parity.pad(rows, parity.MAX_OBSTACLES),
+            np.int32(len(rows)),
+            parity.pad(xy, parity.MAX_OBSTACLES),
             num_clusters=parity.MAX_CLUSTERS,
             max_points=settings.max_points,
         )
-        index, count = np.asarray(index), np.asarray(count)
+        x, y, count = map(np.asarray, lists.table(np.arange(parity.MAX_CLUSTERS)))
         assert not count[len(case.proposals) :].any()
         for row, proposal in enumerate(case.proposals):
             expected = reference.fit_points(proposal.members, height, **slab, **limits)
-            np.testing.assert_array_equal(index[row, : count[row]], expected)
+            points = np.stack([x[: count[row], row], y[: count[row], row]], axis=1)
+            np.testing.assert_array_equal(points, xy[expected])

@@ -10,15 +10,14 @@ import parity
 import pytest
 
 from jaxbox import completion, evidence, reference
+from jaxbox.steps.boxes import complete_trials
+from jaxbox.steps.proposals import Trials
 from jaxbox.types import NOT_A_BOX, Boxes, Rectangles
 
 EVIDENCE = parity.all_options(parity.CONFIG.evidence, "enabled")
 RANGE_CELL_M = parity.CONFIG.evidence.range_cell_m
 SIDES = parity.select_options(
     parity.CONFIG.completion, "seen_length", "seen_width", "seen_weight", "length_margin_m", "width_margin_m"
-)
-COMPLETION = parity.all_options(
-    parity.CONFIG.completion, "mode", "num_rays", "num_final_rays", "along_scene", *SIDES
 )
 NUM_RAYS = parity.CONFIG.completion.num_rays
 SIZES = ("length_m", "width_m")
@@ -38,30 +37,11 @@ def cast_rays(seen, boxes):
 
 
 @jax.jit
-def complete(readings, points, count, seen, prior):
-    """As the wiring does: hypotheses of each reading, their rays and their points, and the choice."""
-    limits, sizes = {name: prior[name] for name in LIMITS}, [prior[name] for name in SIZES]
-
-    def hypotheses(complete_sizes):
-        boxes = [completion.box_hypotheses(r, complete_sizes(r, *sizes), **limits) for r in readings]
-        return jax.tree.map(lambda *of_each: jnp.concatenate(of_each, axis=1), *boxes)
-
-    boxes = hypotheses(completion.usual_sizes)
-    rays = evidence.cast_rays(
-        seen, boxes.center, boxes.length, boxes.width, boxes.yaw, num_rays=NUM_RAYS, range_cell_m=RANGE_CELL_M
-    )
-    inside, near = completion.point_agreement(boxes, points, count)
-    return completion.choose_hypothesis(
-        boxes,
-        hypotheses(functools.partial(completion.likely_sizes, **SIDES)),
-        jnp.repeat(jnp.stack([r.worth for r in readings], axis=1), 6, axis=1),
-        hit=rays.hit,
-        free=rays.free,
-        free_length=rays.free_length,
-        inside=inside,
-        near=near,
-        **COMPLETION,
-    )
+def complete(readings, points, seen, number):
+    """Every cluster tried as one class."""
+    cluster = jnp.arange(parity.MAX_CLUSTERS)
+    trials = Trials(cluster, jnp.full_like(cluster, number), points.start.shape[0])
+    return complete_trials(trials, readings, points, seen, parity.CONFIG)
 
 
 def random_boxes(count, rng):
@@ -158,10 +138,11 @@ def test_completed_boxes_are_those_of_the_reference(cases, number):
         points, count = parity.padded_points([case])
         boxes = complete(
             [rectangles_of(case.proposals, angles), rectangles_of(case.proposals, others)],
-            parity.pad(points, parity.MAX_CLUSTERS),
-            parity.pad(count, parity.MAX_CLUSTERS),
+            parity.point_lists(
+                parity.pad(points, parity.MAX_CLUSTERS), parity.pad(count, parity.MAX_CLUSTERS)
+            ),
             case.evidence_as_input(),
-            prior_of(vehicle, *SIZES, *LIMITS),
+            number,
         )
         pairs.append(rows_of(parity.on_host(boxes), expected))
     ours, theirs = (np.concatenate(rows) for rows in zip(*pairs, strict=True))
@@ -183,8 +164,7 @@ def test_boxes_without_evidence_are_those_of_the_reference(cases, mode):
     else:
 
         def stage(rectangles):
-            sizes = completion.likely_sizes(rectangles, **prior_of(vehicle, *SIZES), **SIDES)
-            return completion.extend_away(rectangles, sizes, **prior_of(vehicle, *LIMITS))
+            return completion.extend_away(rectangles, **prior_of(vehicle, *SIZES, *LIMITS), **SIDES)
 
     stage = jax.jit(stage)
     for case in cases:

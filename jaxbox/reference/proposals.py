@@ -207,14 +207,16 @@ def _complete(
     prior: ClassPrior,
     evidence: Evidence | None,
     settings: Any,
+    mode: str,
 ) -> CompletedBox | None:
-    names = ("mode", "num_rays", "free_weight", "free_length_weight", "inside_weight", "near_weight")
+    names = ("num_rays", "free_weight", "free_length_weight", "inside_weight", "near_weight")
     names += ("closeness_weight", "not_away_cost", "seen_length", "seen_width", "seen_weight")
     names += ("length_margin_m", "width_margin_m")
     return complete_box(
         proposal.xy,
         readings,
         evidence=evidence,
+        mode=mode,
         **select_options(prior, "length_m", "width_m", "max_length_m", "max_width_m"),
         **select_options(settings.completion, *names),
     )
@@ -225,7 +227,7 @@ def _preference(proposals: list[Proposal], evidence: Evidence | None, settings: 
     box, car = settings.box, settings.vehicles.classes[Label.CAR]
     none = np.zeros(box.num_angles)
     fits = (
-        [(p, _complete(p, [_reading(p, none)], car, evidence, settings)) for p in proposals]
+        [(p, _complete(p, [_reading(p, none)], car, evidence, settings, "away")) for p in proposals]
         if box.scene_direction
         else []
     )
@@ -277,7 +279,7 @@ def judge_candidates(
                 continue
             if along_scene:
                 readings.append(_reading(proposal, preference, INSISTENCE))
-            completed = _complete(proposal, readings, prior, evidence, settings)
+            completed = _complete(proposal, readings, prior, evidence, settings, settings.completion.mode)
             if completed is not None:
                 judged = _judge(
                     proposal, completed, label, obstacles=obstacles, evidence=evidence, settings=settings

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jaxbox import box, completion, evidence, hull
 from jaxbox.config import CompletionConfig, DetectorConfig
-from jaxbox.masked import compact, largest_first, map_by_size, map_rows, take
+from jaxbox.masked import compact, largest_first, lookup, map_rows, take
 from jaxbox.steps.common import class_values, stage_options
 from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals, Trials, list_trials, longest_side
@@ -19,7 +19,7 @@ from jaxbox.types import NOT_A_BOX, Boxes, Rectangles
 INSISTENCE = 5.0
 """How often the scene's direction counts for the second reading of a cluster: it bends a closeness only."""
 
-PROPOSAL_CHUNK = 128
+PROPOSAL_CHUNK = 256
 """Proposals held against the evidence at a time: a loop over their points has few, wide steps."""
 
 
@@ -32,11 +32,10 @@ HULL_CHUNK = 32
 class Fits:
     """All rotations of all clusters, and the points that they were fitted to."""
 
-    curve: jax.Array  # (P, A), the clusters with most points first
+    curve: jax.Array  # (A, P), the clusters with most points first
     extents: box.Extents  # likewise
     place: jax.Array  # (P,) where each cluster is in those
-    points: jax.Array  # (P, M, 2) m
-    count: jax.Array  # (P,)
+    points: box.PointLists  # of P clusters
     hull_vertices: jax.Array  # () of the largest hull that was fitted to; 0 where none was
 
 
@@ -44,17 +43,17 @@ def fit_rectangles(obstacles: Obstacles, proposals: Proposals, config: DetectorC
     """Rectangles of all clusters at all rotations, and the points that they were fitted to."""
     settings = config.box
     outline = _hull_points if settings.fit_to == "hull" else _slab_points
-    points, count, hull_vertices = outline(obstacles, proposals, config)
-    order, place = largest_first(count, points.shape[1])
+    points, hull_vertices = outline(obstacles, proposals, config)
+    order, place = largest_first(points.count, points.max_points)
     curve, extents = box.try_rotations(
-        points[order],
-        count[order],
+        points,
+        order,
         proposals.num_clusters,
         criterion=settings.criterion,
         num_angles=settings.num_angles,
         min_distance_m=settings.min_distance_m,
     )
-    return Fits(curve, extents, place, points, count, hull_vertices)
+    return Fits(curve, extents, place, points, hull_vertices)
 
 
 def best_rectangles(fits: Fits, preference: jax.Array, insistence: float = 1.0) -> Rectangles:
@@ -65,7 +64,7 @@ def best_rectangles(fits: Fits, preference: jax.Array, insistence: float = 1.0) 
 
 def _hull_points(
     obstacles: Obstacles, proposals: Proposals, config: DetectorConfig
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+) -> tuple[box.PointLists, jax.Array]:
     """The hull of each cluster, as the points that its rectangle is fitted to (the paper)."""
     num_maps, num_obstacles = proposals.cluster.shape
     index = hull.extreme_points(
@@ -78,7 +77,9 @@ def _hull_points(
     )
     trace = functools.partial(trace_hulls, obstacles.xy, max_vertices=config.hull.max_vertices)
     vertices, count = map_rows(trace, index, num_rows=proposals.num_clusters, chunk=HULL_CHUNK)
-    return vertices, jnp.minimum(count, config.hull.max_vertices), jnp.max(count)
+    x, y = vertices.reshape(-1, 2).T
+    start = jnp.arange(count.shape[0]) * config.hull.max_vertices
+    return box.PointLists(x, y, start, count, config.hull.max_vertices), jnp.max(count)
 
 
 def trace_hulls(xy: jax.Array, index: jax.Array, *, max_vertices: int) -> tuple[jax.Array, jax.Array]:
@@ -88,22 +89,23 @@ def trace_hulls(xy: jax.Array, index: jax.Array, *, max_vertices: int) -> tuple[
 
 def _slab_points(
     obstacles: Obstacles, proposals: Proposals, config: DetectorConfig
-) -> tuple[jax.Array, jax.Array, jax.Array]:
+) -> tuple[box.PointLists, jax.Array]:
     """The points of each cluster between the slab's heights, or all where those are few."""
     num_maps, num_obstacles = proposals.cluster.shape
     num_clusters = proposals.num_points.shape[0]
-    # The points of all maps in one list, without gaps: it is sorted as far as it is filled.
-    entry, _ = compact(proposals.fitted.reshape(-1), num_maps * max_slab_points(obstacles.num_rows, config))
-    cluster = take(proposals.cluster.reshape(-1), entry, num_clusters)
-    index, count = box.sample_points(cluster, num_clusters=num_clusters, max_points=config.box.max_points)
-
-    def gather(index: jax.Array) -> jax.Array:
-        place = take(entry, index, num_maps * num_obstacles)
-        row = jnp.where(place < num_maps * num_obstacles, place % num_obstacles, num_obstacles)
-        return take(obstacles.xy, row)
-
-    points = map_rows(gather, index, num_rows=proposals.num_clusters, chunk=box.TABLE_CHUNK)
-    return points, count, jnp.int32(0)
+    # The points of all maps in one list, without gaps.
+    entry, num = compact(proposals.fitted.reshape(-1), num_maps * max_slab_points(obstacles.num_rows, config))
+    # The remainder by the number of obstacles, without the division.
+    row = entry - num_obstacles * sum(entry >= num_obstacles * i for i in range(1, num_maps))
+    lists = box.list_points(
+        jnp.take(proposals.cluster.reshape(-1), entry, mode="clip"),
+        row,
+        num,
+        obstacles.xy,
+        num_clusters=num_clusters,
+        max_points=config.box.max_points,
+    )
+    return lists, jnp.int32(0)
 
 
 def max_slab_points(capacity: int, config: DetectorConfig) -> int:
@@ -132,7 +134,7 @@ def complete_boxes(
     if config.box.scene_direction and config.completion.along_scene:
         readings.append(best_rectangles(fits, preference, INSISTENCE))
     trials = list_trials(proposals, readings, config)
-    return trials, _complete(trials, readings, fits, seen, config)
+    return trials, complete_trials(trials, readings, fits.points, seen, config)
 
 
 def _scene_preference(
@@ -144,7 +146,8 @@ def _scene_preference(
     rectangles = jax.tree.map(lambda a: a[:size], best_rectangles(fits, jnp.zeros(settings.num_angles)))
     long = longest_side(rectangles) >= settings.direction_min_extent_m
     cluster, num = compact(long & (jnp.arange(size) < proposals.num_first), size)
-    boxes = _complete(Trials(cluster, jnp.zeros_like(cluster), num), [rectangles], fits, seen, config)
+    rectangles = jax.tree.map(lambda a: take(a, cluster), rectangles)
+    boxes = completion.extend_away(rectangles, **_class_options(jnp.zeros_like(cluster), config))
     rays = cast_rays(boxes, num, seen, config)
     voting = (jnp.arange(size) < num) & (boxes.objective > NOT_A_BOX)
     voting = voting & (rays.free_length <= settings.direction_max_free)
@@ -159,75 +162,101 @@ def _scene_preference(
     )
 
 
-def _complete(
+def _class_options(label: jax.Array, config: DetectorConfig) -> dict[str, jax.Array]:
+    """Limits and likely sizes of classes, as `completion.extend_away` takes them."""
+    names = ("length_m", "width_m", "max_length_m", "max_width_m")
+    of_class = {name: class_values(config, name, label) for name in names}
+    return of_class | _fields(config.completion, _SIDE_FIELDS)
+
+
+def complete_trials(
     trials: Trials,
     readings: Sequence[Rectangles],
-    fits: Fits,
+    points: box.PointLists,
     seen: evidence.Evidence | None,
     config: DetectorConfig,
 ) -> Boxes:
-    settings = config.completion
-    limits = {name: class_values(config, name, trials.label) for name in ("max_length_m", "max_width_m")}
-    usual = tuple(class_values(config, name, trials.label) for name in ("length_m", "width_m"))
+    """The box (Q,) of each trial, of those that the readings of its cluster allow."""
+    options = _class_options(trials.label, config)
+    limits = {name: options[name] for name in ("max_length_m", "max_width_m")}
+    rectangles = jax.tree.map(lambda a: take(a, trials.cluster), readings[0])
+    if config.completion.mode == "none":
+        return completion.keep_measured(rectangles, **limits)
+    if config.completion.mode == "away":
+        return completion.extend_away(rectangles, **options)
+    assert seen is not None  # see check_settings
+    each = [completion.ways_to_lie(rectangle) for rectangle in readings]
+    ways = jax.tree.map(lambda *of_reading: jnp.concatenate(of_reading), *each)
+    present = jnp.arange(trials.cluster.shape[0]) < trials.num
+    possible = present & completion.fits(_of_trial(ways, trials.cluster), **limits)
+    # A second reading at the angle of the first has nothing to add.
+    angles = take(jnp.stack([r.angle for r in readings], axis=1), trials.cluster).T
+    differs = jnp.concatenate([jnp.ones_like(angles[:1], bool), angles[1:] != angles[:1]])
+    possible = possible & jnp.repeat(differs, completion.NUM_WAYS, axis=0)
+    placement, objective = _judge_ways(trials, ways, possible, points, seen, config)
+    best = jnp.argmax(objective, axis=0)
+    chosen = (best, jnp.arange(best.shape[0]))
+    way = jax.tree.map(lambda a: lookup(a, best, trials.cluster), ways)
+    sizes = completion.likely_sizes(
+        way, options["length_m"], options["width_m"], **_fields(config.completion, _SIDE_FIELDS)
+    )
+    return completion.place(way, sizes, placement[chosen], objective[chosen])
 
-    def complete(rows: tuple[jax.Array, dict[str, jax.Array], tuple[jax.Array, jax.Array]]) -> Boxes:
-        cluster, limits, usual = rows
-        each = [jax.tree.map(lambda a: take(a, cluster), rectangles) for rectangles in readings]
-        if settings.mode == "none":
-            return completion.keep_measured(each[0], **limits)
-        likely = functools.partial(
-            completion.likely_sizes, length_m=usual[0], width_m=usual[1], **_fields(settings, _SIDE_FIELDS)
+
+def _of_trial(ways: completion.Ways, cluster: jax.Array) -> completion.Ways:
+    return jax.tree.map(lambda a: jnp.take(a, cluster, axis=1, mode="clip"), ways)
+
+
+def _judge_ways(
+    trials: Trials,
+    ways: completion.Ways,
+    possible: jax.Array,
+    points: box.PointLists,
+    seen: evidence.Evidence,
+    config: DetectorConfig,
+) -> tuple[jax.Array, jax.Array]:
+    """The best placement of each possible way of each trial, and its J: (W, Q) each."""
+    settings = config.completion
+    num_trials = possible.shape[1]
+    index, num = compact(possible.reshape(-1), possible.size)
+    names = ("length_m", "width_m")
+
+    def judge(index: jax.Array) -> tuple[jax.Array, jax.Array]:
+        trial = index % num_trials
+        cluster = trials.cluster[trial]
+        way = jax.tree.map(lambda a: lookup(a, index // num_trials, cluster), ways)
+        usual = {name: class_values(config, name, trials.label[trial]) for name in names}
+        boxes = completion.hypotheses(way, **usual)
+        rays = _cast(boxes, settings.num_rays, seen, config)
+        agreement = completion.point_agreement(
+            boxes, *points.table(cluster), **_fields(settings, _POINT_FIELDS)
         )
-        if settings.mode == "away":
-            return completion.extend_away(each[0], likely(each[0]), **limits)
-        assert seen is not None  # see check_settings
-        judged = _hypotheses(each, [completion.usual_sizes(r, *usual) for r in each], limits)
-        answers = _hypotheses(each, [likely(r) for r in each], limits)
-        rays = _cast_chunk(judged, settings.num_rays, seen, config)
-        points, count = take(fits.points, cluster), take(fits.count, cluster)
-        inside, near = completion.point_agreement(judged, points, count)
-        return completion.choose_hypothesis(
-            judged,
-            answers,
-            jnp.repeat(jnp.stack([r.worth for r in each], axis=1), judged.yaw.shape[1] // len(each), axis=1),
+        return completion.choose_placement(
+            way.worth,
+            agreement,
             hit=rays.hit,
             free=rays.free,
             free_length=rays.free_length,
-            inside=inside,
-            near=near,
             **_fields(settings, _OBJECTIVE_FIELDS),
         )
 
-    return map_by_size(
-        complete,
-        (trials.cluster, limits, usual),
-        take(fits.count, trials.cluster),
-        max_size=fits.points.shape[1],
-        num_rows=trials.num,
-        chunk=PROPOSAL_CHUNK,
-    )
+    placement, objective = map_rows(judge, index, num_rows=num, chunk=PROPOSAL_CHUNK)
+    everywhere = jnp.zeros(possible.size, jnp.int32).at[index].set(placement, mode="drop")
+    judged = jnp.full(possible.size, NOT_A_BOX).at[index].set(objective, mode="drop")
+    return everywhere.reshape(possible.shape), judged.reshape(possible.shape)
 
 
 _SIDE_FIELDS = ("seen_length", "seen_width", "seen_weight", "length_margin_m", "width_margin_m")
-_OBJECTIVE_FIELDS = (
-    "free_weight", "free_length_weight", "inside_weight", "near_weight", "closeness_weight", "not_away_cost",
-)  # fmt: skip
+_POINT_FIELDS = ("inside_weight", "near_weight")
+_OBJECTIVE_FIELDS = ("free_weight", "free_length_weight", "closeness_weight", "not_away_cost")
 
 
 def _fields(settings: CompletionConfig, names: Sequence[str]) -> dict[str, Any]:
     return {name: getattr(settings, name) for name in names}
 
 
-def _hypotheses(
-    readings: Sequence[Rectangles], sizes: Sequence[jax.Array], limits: dict[str, jax.Array]
-) -> Boxes:
-    """(P, S) the hypotheses of all readings of each cluster, side by side."""
-    boxes = [completion.box_hypotheses(r, size, **limits) for r, size in zip(readings, sizes, strict=True)]
-    return jax.tree.map(lambda *of_each: jnp.concatenate(of_each, axis=1), *boxes)
-
-
-def _cast_chunk(
-    boxes: Boxes, num_rays: int, seen: evidence.Evidence, config: DetectorConfig
+def _cast(
+    boxes: Boxes | completion.Hypotheses, num_rays: int, seen: evidence.Evidence, config: DetectorConfig
 ) -> evidence.RayFractions:
     return evidence.cast_rays(
         seen,
@@ -244,5 +273,5 @@ def cast_rays(
     boxes: Boxes, num: jax.Array, seen: evidence.Evidence, config: DetectorConfig
 ) -> evidence.RayFractions:
     """What the rays over each box met, finely enough for its score."""
-    cast = functools.partial(_cast_chunk, num_rays=config.completion.num_final_rays, seen=seen, config=config)
+    cast = functools.partial(_cast, num_rays=config.completion.num_final_rays, seen=seen, config=config)
     return map_rows(cast, boxes, num_rows=num, chunk=PROPOSAL_CHUNK)
