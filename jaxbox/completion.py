@@ -131,30 +131,30 @@ def _extend(side: tuple[jax.Array, jax.Array], size: jax.Array) -> tuple[jax.Arr
     return away, towards, (low + high) / 2
 
 
-def _longer_side(rectangle: Rectangles) -> Ways:
+def longer_side(rectangle: Rectangles) -> Ways:
+    """Ways (P,) with the longer side as length."""
     first, second = (jax.tree.map(lambda a, i=i: a[i], ways_to_lie(rectangle)) for i in range(NUM_WAYS))
     longer = second.measured[0] > first.measured[0]
     return jax.tree.map(lambda a, b: jnp.where(longer, b, a), first, second)
 
 
-def keep_measured(rectangle: Rectangles, *, max_length_m: jax.Array, max_width_m: jax.Array) -> Boxes:
-    """The rectangles as measured, the longer side as length (the paper).
+def keep_measured(ways: Ways, *, max_length_m: jax.Array, max_width_m: jax.Array) -> Boxes:
+    """The rectangles as measured (the paper).
 
     Args:
-      rectangle: P rectangles.
-      max_length_m: (P,) float32, m.
-      max_width_m: (P,) float32, m.
+      ways: of any shape.
+      max_length_m: (...) float32, m.
+      max_width_m: (...) float32, m.
 
     Returns:
-      Boxes (P,); no box where a measured side is too long.
+      Boxes (...); no box where a measured side is too long.
     """
-    way = _longer_side(rectangle)
-    certain = jnp.where(fits(way, max_length_m, max_width_m), CERTAIN, NOT_A_BOX)
-    return place(way, way.measured, jnp.zeros_like(certain, jnp.int32), certain)
+    certain = jnp.where(fits(ways, max_length_m, max_width_m), CERTAIN, NOT_A_BOX)
+    return place(ways, ways.measured, jnp.zeros_like(certain, jnp.int32), certain)
 
 
 def extend_away(
-    rectangle: Rectangles,
+    ways: Ways,
     length_m: jax.Array,
     width_m: jax.Array,
     *,
@@ -162,25 +162,24 @@ def extend_away(
     max_width_m: jax.Array,
     **sides: jax.Array | float,
 ) -> Boxes:
-    """Completes both sides away from the sensor to their likely sizes, the longer side as length.
+    """Completes both sides away from the sensor to their likely sizes.
 
     The sensor sees the near ends of both sides; what is missing is behind them.
 
     Args:
-      rectangle: P rectangles.
-      length_m: (P,) float32, m, of the class.
-      width_m: (P,) float32, m, of the class.
-      max_length_m: (P,) float32, m.
-      max_width_m: (P,) float32, m.
+      ways: of any shape.
+      length_m: (...) float32, m, of the class.
+      width_m: (...) float32, m, of the class.
+      max_length_m: (...) float32, m.
+      max_width_m: (...) float32, m.
       **sides: the other arguments of `likely_sizes`.
 
     Returns:
-      Boxes (P,); no box where a measured side is too long.
+      Boxes (...); no box where a measured side is too long.
     """
-    way = _longer_side(rectangle)
-    certain = jnp.where(fits(way, max_length_m, max_width_m), CERTAIN, NOT_A_BOX)
-    sizes = likely_sizes(way, length_m, width_m, **sides)
-    return place(way, sizes, jnp.zeros_like(certain, jnp.int32), certain)
+    certain = jnp.where(fits(ways, max_length_m, max_width_m), CERTAIN, NOT_A_BOX)
+    sizes = likely_sizes(ways, length_m, width_m, **sides)
+    return place(ways, sizes, jnp.zeros_like(certain, jnp.int32), certain)
 
 
 def place(
@@ -189,13 +188,13 @@ def place(
     """Boxes of a size: the length away from the sensor, the width where `placement` says.
 
     Args:
-      ways: Q of them.
-      sizes: length and width (Q,) float32, m, at least as measured.
-      placement: (Q,) int32, in [0, NUM_PLACEMENTS).
-      objective: (Q,) float32.
+      ways: of any shape.
+      sizes: length and width (...) float32, m, at least as measured.
+      placement: (...) int32, in [0, NUM_PLACEMENTS).
+      objective: (...) float32.
 
     Returns:
-      Boxes (Q,).
+      Boxes (...).
     """
     u, across = _extend(ways.along, sizes[0])[0], _extend(ways.across, sizes[1])
     v = jnp.select([placement == i for i in range(NUM_PLACEMENTS)], across)

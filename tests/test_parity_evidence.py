@@ -162,11 +162,8 @@ def test_boxes_without_evidence_are_those_of_the_reference(cases, mode):
     if mode == "none":
         stage = functools.partial(completion.keep_measured, **prior_of(vehicle, *LIMITS))
     else:
-
-        def stage(rectangles):
-            return completion.extend_away(rectangles, **prior_of(vehicle, *SIZES, *LIMITS), **SIDES)
-
-    stage = jax.jit(stage)
+        stage = functools.partial(completion.extend_away, **prior_of(vehicle, *SIZES, *LIMITS), **SIDES)
+    stage = jax.jit(lambda rectangles, stage=stage: stage(completion.longer_side(rectangles)))
     for case in cases:
         angles = [int(np.argmax(p.curve)) for p in case.proposals]
         expected = [

@@ -168,11 +168,15 @@ def complete_box(
         return _completed(ways[0], _place(ways[0], 0.0, 0.0, KEEP_NEAR), NEUTRAL_OBJECTIVE)
 
     def answer(way: _Way, keep: int, objective: float) -> CompletedBox:
-        length = likely_size(
-            way.length, length_m, margin_m=length_margin_m, seen=seen_length, seen_weight=seen_weight
-        )
-        width = likely_size(
-            way.width, width_m, margin_m=width_margin_m, seen=seen_width, seen_weight=seen_weight
+        length, width = _likely_sides(
+            way,
+            length_m=length_m,
+            width_m=width_m,
+            seen_length=seen_length,
+            seen_width=seen_width,
+            seen_weight=seen_weight,
+            length_margin_m=length_margin_m,
+            width_margin_m=width_margin_m,
         )
         return _completed(way, _place(way, length, width, keep), objective)
 
@@ -188,6 +192,28 @@ def complete_box(
     objective -= not_away_cost * np.array([keep != KEEP_NEAR for _, keep in trials])
     best = int(np.argmax(objective))
     return answer(*trials[best], float(objective[best]))
+
+
+def boxes_away(
+    rectangle: Reading, *, max_length_m: float, max_width_m: float, **sides: float
+) -> list[CompletedBox]:
+    """The boxes with either side as length, completed away from the sensor.
+
+    Args:
+      rectangle: of the cluster.
+      max_length_m: no such vehicle measures longer.
+      max_width_m: no such vehicle measures wider.
+      **sides: length_m, width_m, seen_length, seen_width, seen_weight, length_margin_m and width_margin_m,
+        see `complete_box`.
+
+    Returns:
+      Those that the class allows: none to two.
+    """
+    ways = [way for way in _ways(rectangle) if way.length <= max_length_m and way.width <= max_width_m]
+    return [
+        _completed(way, _place(way, *_likely_sides(way, **sides), KEEP_NEAR), NEUTRAL_OBJECTIVE)
+        for way in ways
+    ]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -215,6 +241,25 @@ def _ways(rectangle: Reading) -> list[_Way]:
         _Way((u0, u1), (v0, v1), rectangle.angle, rectangle.value),
         _Way((v0, v1), (-u1, -u0), rectangle.angle + np.pi / 2, rectangle.value),
     ]
+
+
+def _likely_sides(
+    way: _Way,
+    *,
+    length_m: float,
+    width_m: float,
+    seen_length: float,
+    seen_width: float,
+    seen_weight: float,
+    length_margin_m: float,
+    width_margin_m: float,
+) -> tuple[float, float]:
+    return (
+        likely_size(
+            way.length, length_m, margin_m=length_margin_m, seen=seen_length, seen_weight=seen_weight
+        ),
+        likely_size(way.width, width_m, margin_m=width_margin_m, seen=seen_width, seen_weight=seen_weight),
+    )
 
 
 def _place(way: _Way, length_m: float, width_m: float, keep_width: int) -> np.ndarray:

@@ -20,6 +20,7 @@ from jaxbox.reference.clusters import (
 from jaxbox.reference.completion import (
     CompletedBox,
     Reading,
+    boxes_away,
     complete_box,
     direction_preference,
     scene_direction,
@@ -207,16 +208,14 @@ def _complete(
     prior: ClassPrior,
     evidence: Evidence | None,
     settings: Any,
-    mode: str,
 ) -> CompletedBox | None:
-    names = ("num_rays", "free_weight", "free_length_weight", "inside_weight", "near_weight")
+    names = ("mode", "num_rays", "free_weight", "free_length_weight", "inside_weight", "near_weight")
     names += ("closeness_weight", "not_away_cost", "seen_length", "seen_width", "seen_weight")
     names += ("length_margin_m", "width_margin_m")
     return complete_box(
         proposal.xy,
         readings,
         evidence=evidence,
-        mode=mode,
         **select_options(prior, "length_m", "width_m", "max_length_m", "max_width_m"),
         **select_options(settings.completion, *names),
     )
@@ -226,21 +225,27 @@ def _preference(proposals: list[Proposal], evidence: Evidence | None, settings: 
     """The gain of each rotation from the direction that the first map's clusters share."""
     box, car = settings.box, settings.vehicles.classes[Label.CAR]
     none = np.zeros(box.num_angles)
-    fits = (
-        [(p, _complete(p, [_reading(p, none)], car, evidence, settings, "away")) for p in proposals]
-        if box.scene_direction
-        else []
-    )
-    fits = [(p, fit) for p, fit in fits if fit is not None]
+    if not box.scene_direction:
+        return none
+    names = ("seen_length", "seen_width", "seen_weight", "length_margin_m", "width_margin_m")
+    options = select_options(settings.completion, *names)
+    options |= select_options(car, "length_m", "width_m", "max_length_m", "max_width_m")
+    fits = [(p, boxes_away(_reading(p, none), **options)) for p in proposals]
+    fits = [(p, boxes) for p, boxes in fits if boxes]
     if not fits:
         return none
-    boxes = np.array([fit.box for _, fit in fits])
-    rays = box_evidence(boxes, evidence, num_rays=settings.completion.num_final_rays)
+
+    def free_length(boxes: list[CompletedBox]) -> float:
+        places = np.array([fit.box for fit in boxes])
+        rays = box_evidence(places, evidence, num_rays=settings.completion.num_final_rays)
+        return rays.free_length.min()
+
+    # Modulo a quarter turn either way to lie votes for the same.
     direction = scene_direction(
-        boxes[:, 4],
-        np.array([max(fit.measured_length_m, fit.measured_width_m) for _, fit in fits]),
+        np.array([boxes[0].box[4] for _, boxes in fits]),
+        np.array([max(boxes[0].measured_length_m, boxes[0].measured_width_m) for _, boxes in fits]),
         np.array([len(p.members) for p, _ in fits]),
-        rays.free_length,
+        np.array([free_length(boxes) for _, boxes in fits]),
         num_angles=box.num_angles,
         sigma_deg=box.direction_sigma_deg,
         min_extent_m=box.direction_min_extent_m,
@@ -279,7 +284,7 @@ def judge_candidates(
                 continue
             if along_scene:
                 readings.append(_reading(proposal, preference, INSISTENCE))
-            completed = _complete(proposal, readings, prior, evidence, settings, settings.completion.mode)
+            completed = _complete(proposal, readings, prior, evidence, settings)
             if completed is not None:
                 judged = _judge(
                     proposal, completed, label, obstacles=obstacles, evidence=evidence, settings=settings

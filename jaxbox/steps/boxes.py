@@ -22,6 +22,8 @@ INSISTENCE = 5.0
 PROPOSAL_CHUNK = 256
 """Proposals held against the evidence at a time: a loop over their points has few, wide steps."""
 
+VOTER_CHUNK = 64
+"""Boxes that may vote for the scene's direction at a time: there are few."""
 
 HULL_CHUNK = 32
 """Clusters whose hulls are traced at a time."""
@@ -146,16 +148,21 @@ def _scene_preference(
     rectangles = jax.tree.map(lambda a: a[:size], best_rectangles(fits, jnp.zeros(settings.num_angles)))
     long = longest_side(rectangles) >= settings.direction_min_extent_m
     cluster, num = compact(long & (jnp.arange(size) < proposals.num_first), size)
-    rectangles = jax.tree.map(lambda a: take(a, cluster), rectangles)
-    boxes = completion.extend_away(rectangles, **_class_options(jnp.zeros_like(cluster), config))
-    rays = cast_rays(boxes, num, seen, config)
-    voting = (jnp.arange(size) < num) & (boxes.objective > NOT_A_BOX)
-    voting = voting & (rays.free_length <= settings.direction_max_free)
+    voters = jax.tree.map(lambda a: take(a, cluster), rectangles)
+
+    def free_length(voters: Rectangles) -> jax.Array:
+        """The least of both ways that it may lie, completed away from the sensor."""
+        ways = completion.ways_to_lie(voters)
+        boxes = completion.extend_away(ways, **_class_options(jnp.zeros_like(ways.yaw, jnp.int32), config))
+        rays = _cast(boxes, config.completion.num_final_rays, seen, config)
+        return jnp.min(jnp.where(boxes.objective > NOT_A_BOX, rays.free_length, jnp.inf), axis=0)
+
+    free = map_rows(free_length, voters, num_rows=num, chunk=VOTER_CHUNK)
     return box.scene_preference(
-        boxes.yaw,
-        jnp.max(boxes.measured, axis=1),
+        voters.angle,
+        longest_side(voters),
         take(proposals.num_points, cluster),
-        voting,
+        (jnp.arange(size) < num) & (free <= settings.direction_max_free),
         num_angles=settings.num_angles,
         weight=settings.direction_weight,
         sigma_deg=settings.direction_sigma_deg,
@@ -179,11 +186,11 @@ def complete_trials(
     """The box (Q,) of each trial, of those that the readings of its cluster allow."""
     options = _class_options(trials.label, config)
     limits = {name: options[name] for name in ("max_length_m", "max_width_m")}
-    rectangles = jax.tree.map(lambda a: take(a, trials.cluster), readings[0])
-    if config.completion.mode == "none":
-        return completion.keep_measured(rectangles, **limits)
-    if config.completion.mode == "away":
-        return completion.extend_away(rectangles, **options)
+    if config.completion.mode != "evidence":
+        longer = completion.longer_side(jax.tree.map(lambda a: take(a, trials.cluster), readings[0]))
+        if config.completion.mode == "none":
+            return completion.keep_measured(longer, **limits)
+        return completion.extend_away(longer, **options)
     assert seen is not None  # see check_settings
     each = [completion.ways_to_lie(rectangle) for rectangle in readings]
     ways = jax.tree.map(lambda *of_reading: jnp.concatenate(of_reading), *each)
