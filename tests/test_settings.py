@@ -5,8 +5,17 @@ import dataclasses
 import jax
 import pytest
 
-from jaxbox.config import DetectorConfig
-from jaxbox.settings import changed_settings, check_traced, parse_change, replace_settings, traced_settings
+from jaxbox import io
+from jaxbox.config import ComponentMap, DetectorConfig
+from jaxbox.settings import (
+    changed_settings,
+    check_traced,
+    parse_change,
+    replace_settings,
+    settings_from_toml,
+    settings_to_toml,
+    traced_settings,
+)
 
 PRESETS = list(DetectorConfig.presets().values())
 
@@ -79,3 +88,76 @@ def test_a_change_is_a_literal_or_a_word():
     assert parse_change("clustering.max_obstacles=None") == ("clustering.max_obstacles", None)
     with pytest.raises(ValueError, match="FIELD=VALUE"):
         parse_change("filtering.enabled")
+
+
+# --- settings files -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("config", PRESETS, ids=DetectorConfig.presets())
+@pytest.mark.parametrize("base", PRESETS, ids=DetectorConfig.presets())
+def test_a_written_file_makes_the_same_settings_from_any_base(tmp_path, config, base):
+    config = replace_settings(config, {"clustering.max_obstacles": 9, "vehicles.min_score": 1e-9})
+    assert settings_from_toml(settings_to_toml(config), base=base) == config
+    io.write_config(tmp_path / "a.toml", config)
+    assert io.read_config(tmp_path / "a.toml", base=base) == config
+
+
+def test_tables_dotted_names_and_arrays_of_tables_say_the_same():
+    changed = replace_settings(
+        DetectorConfig(), {"vehicles.min_score": 0.5, "clustering.maps.1.min_height_m": 0.4}
+    )
+    for text in (
+        "[vehicles]\nmin_score = 0.5\n[[clustering.maps]]\n[[clustering.maps]]\nmin_height_m = 0.4\n"
+        "[[clustering.maps]]\n",
+        "vehicles.min_score = 0.5\nclustering.maps.1.min_height_m = 0.4\n",
+        '"vehicles.min_score" = 0.5\n"clustering.maps.1.min_height_m" = 0.4\n',
+    ):
+        assert settings_from_toml(text) == changed
+
+
+def test_a_file_names_its_preset_and_its_arrays_set_their_length():
+    assert settings_from_toml('preset = "paper"') == DetectorConfig.paper()
+    assert settings_from_toml('preset = "paper"', base=DetectorConfig()) == DetectorConfig()
+    maps = settings_from_toml("[[clustering.maps]]\n" * 4).clustering.maps
+    assert maps == (*DetectorConfig().clustering.maps, ComponentMap())
+    assert settings_from_toml('box.max_slab_points = "none"').box.max_slab_points is None
+
+
+def test_a_whole_number_for_a_threshold_compiles_nothing_anew():
+    changed = settings_from_toml("vehicles.ring_weight = 7")
+    assert type(changed.vehicles.ring_weight) is float
+    assert type(replace_settings(changed, {"region.half_x_m": 70}).region.half_x_m) is float
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("[vehicles]\nmin_scor = 0.5", "no setting vehicles.min_scor; nearest are vehicles.min_score"),
+        ("[vehicle]\nmin_score = 0.5", "no setting vehicle.min_score; nearest are vehicles.min_score"),
+        ("[[clustering.mapz]]", "clustering.mapz is no list; nearest lists are clustering.maps"),
+        ("[[vehicles.classes]]", "vehicles.classes has 1 entries; it must have 3"),
+        ("clustering.maps = []", "clustering.maps has 0 entries; it must have at least 1"),
+        ("vehicles = 3", "no setting vehicles"),
+        ("vehicles.min_score = [1, 2]", "must be a finite number"),
+        ("vehicles.min_score = nan", "must be a finite number"),
+        ("vehicles.min_score = 'none'", "must be a finite number"),
+        ("preset = 'best'", "best: there is no such preset; choose one of default"),
+        ("preset = ['best']", "there is no such preset"),
+        ("a = = 1", "line 1"),
+    ],
+)
+def test_a_file_that_cannot_be_taken_is_refused_with_its_name_and_the_setting(tmp_path, text, expected):
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(io.InputError, match=rf"a\.toml: .*{expected}"):
+        io.read_config(tmp_path / "a.toml")
+
+
+def test_json_settings_are_taken_and_named_so(tmp_path):
+    (tmp_path / "a.json").write_text('{"vehicles.min_score": 0.5, "box": {"max_slab_points": null}}')
+    assert io.read_config(tmp_path / "a.json").vehicles.min_score == 0.5
+    (tmp_path / "a.json").write_text("[1]")
+    with pytest.raises(io.InputError, match="must be one object"):
+        io.read_config(tmp_path / "a.json")
+    (tmp_path / "a.json").write_text("vehicles.min_score = 0.5")
+    with pytest.raises(io.InputError, match="no JSON"):
+        io.read_config(tmp_path / "a.json")

@@ -1,36 +1,34 @@
 """The settings that a command was asked for: a preset, a file of changes, and changes one by one."""
 
-import json
 import pathlib
 from collections.abc import Sequence
 
 from jaxbox.config import DetectorConfig
-from jaxbox.io import InputError
-from jaxbox.settings import parse_change, replace_settings
+from jaxbox.io import InputError, read_config
+from jaxbox.settings import parse_change, preset_settings, replace_settings
 from jaxbox.steps import check_settings
 
 
-def chosen_config(preset: str, settings: pathlib.Path | None, changes: Sequence[str]) -> DetectorConfig:
+def chosen_config(preset: str | None, file: pathlib.Path | None, changes: Sequence[str]) -> DetectorConfig:
     """Puts the settings together.
 
     Args:
-      preset: name of the preset to start from.
-      settings: JSON file of values by dotted name, such as ``best.json`` of ``jaxbox tune``, or None.
+      preset: name of the preset to start from; None for the one that the file names, or the default.
+      file: settings file, TOML or JSON, or None.
       changes: each ``FIELD=VALUE``; they come last.
 
     Returns:
       The settings.
 
     Raises:
-      InputError: for an unknown preset or setting, a value that does not fit, a file that is no such JSON,
+      InputError: for an unknown preset or setting, a value that does not fit, a file that is no such file,
         or settings that contradict each other.
     """
-    if preset not in DetectorConfig.presets():
-        names = ", ".join(DetectorConfig.presets())
-        raise InputError(f"--preset {preset}: there is no such preset; choose one of {names}.")
-    config = DetectorConfig.presets()[preset]
-    if settings is not None:
-        config = _with_file(config, settings)
+    try:
+        base = None if preset is None else preset_settings(preset)
+    except ValueError as error:
+        raise InputError(f"--preset {error}") from error
+    config = (base or DetectorConfig()) if file is None else read_config(file, base=base)
     try:
         config = replace_settings(config, dict(parse_change(change) for change in changes))
     except ValueError as error:
@@ -40,18 +38,3 @@ def chosen_config(preset: str, settings: pathlib.Path | None, changes: Sequence[
     except ValueError as error:
         raise InputError(str(error)) from error
     return config
-
-
-def _with_file(config: DetectorConfig, path: pathlib.Path) -> DetectorConfig:
-    try:
-        values = json.loads(path.read_text("utf-8"))
-    except ValueError as error:
-        raise InputError(
-            f"{path}: no JSON ({error}); give one such as best.json of `jaxbox tune`."
-        ) from error
-    if not isinstance(values, dict):
-        raise InputError(f'{path}: it must be one object of values by name: {{"box.criterion": "area"}}.')
-    try:
-        return replace_settings(config, values)
-    except ValueError as error:
-        raise InputError(f"{path}: {error}") from error

@@ -7,6 +7,7 @@ from jaxbox.io.argoverse2 import (
     read_argoverse2_points,
     read_feather,
 )
+from jaxbox.io.config import read_config, write_config
 from jaxbox.io.drives import read_drives
 from jaxbox.io.images import read_image
 from jaxbox.io.jsonl import detections_record, read_jsonl, write_jsonl
@@ -54,6 +55,7 @@ __all__ = [
     "read_argoverse2_points",
     "read_bin",
     "read_calibration",
+    "read_config",
     "read_drives",
     "read_feather",
     "read_image",
@@ -74,6 +76,7 @@ __all__ = [
     "read_text_points",
     "write_bin",
     "write_calibration",
+    "write_config",
     "write_jsonl",
     "write_labels",
 ]

@@ -1,0 +1,59 @@
+"""Settings files: TOML, or JSON such as ``best.json`` of ``jaxbox tune``, with the same names."""
+
+import json
+import os
+import pathlib
+import tomllib
+from typing import Any
+
+from jaxbox.config import DetectorConfig
+from jaxbox.io._files import InputError, atomic_writer, read_text
+from jaxbox.settings import apply_settings, base_of, settings_to_toml, without_preset
+
+
+def read_config(path: str | os.PathLike[str], *, base: DetectorConfig | None = None) -> DetectorConfig:
+    """Reads a settings file.
+
+    Args:
+      path: TOML, or JSON where it is named so: tables and dotted names of `jaxbox.settings`.
+      base: what the file changes; None for the preset that it names under ``preset``, or the default one.
+
+    Returns:
+      The settings.
+
+    Raises:
+      InputError: naming file and line or setting, with the nearest names for an unknown one.
+    """
+    tables = _parse(path)
+    try:
+        return apply_settings(base_of(tables) if base is None else base, without_preset(tables))
+    except ValueError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def write_config(path: str | os.PathLike[str], config: DetectorConfig) -> None:
+    """Writes every setting, from which `read_config` makes the same settings.
+
+    Args:
+      path: the file, ``.toml``; its folder is made where it is missing.
+      config: the settings, each threshold one number.
+    """
+    with atomic_writer(path) as handle:
+        handle.write("# Settings of jaxbox; read by `jaxbox detect --config` and jaxbox.io.read_config.\n\n")
+        handle.write(settings_to_toml(config))
+
+
+def _parse(path: str | os.PathLike[str]) -> dict[str, Any]:
+    text = read_text(path)
+    kind, parse = (
+        ("JSON", json.loads) if pathlib.Path(path).suffix.lower() == ".json" else ("TOML", tomllib.loads)
+    )
+    try:
+        tables = parse(text)
+    except ValueError as error:
+        raise InputError(
+            f"{path}: no {kind} ({error}); mend the line, or name the file by its kind."
+        ) from error
+    if not isinstance(tables, dict):
+        raise InputError(f'{path}: it must be one object of values by name: {{"box.criterion": "area"}}.')
+    return tables
