@@ -247,7 +247,7 @@ def test_detections_survive_json_lines(tmp_path):
     io.write_jsonl(tmp_path / "a.jsonl", [record, {"name": "000002"}])
     back, other = io.read_jsonl(tmp_path / "a.jsonl")
     assert (back, other) == (record, {"name": "000002"})
-    assert set(back) == {"name", "boxes", "status", "counts"}
+    assert set(back) == {"name", "timestamp_ns", "boxes", "status", "counts"}
     (box,) = back["boxes"]
     assert (box["label"], box["num_points"]) == ("truck", 9)
     np.testing.assert_array_equal(np.float32(box["center"]), np.float32([20, 1, -1]))

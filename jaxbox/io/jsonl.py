@@ -1,33 +1,40 @@
 """Detections as JSON Lines: one sweep a line, in the sensor frame, so that no calibration is needed."""
 
+import contextlib
 import dataclasses
 import json
 import os
-from collections.abc import Iterable
+import pathlib
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from jaxbox.io._files import InputError, atomic_writer, read_text
+from jaxbox.io.results import ResultFile, WriteResult
 from jaxbox.types import Counts, Detections, Label, Status
 
 
-def detections_record(name: str, detections: Detections, *, min_score: float = 0.0) -> dict[str, Any]:
+def detections_record(
+    name: str, detections: Detections, *, min_score: float = 0.0, timestamp_ns: int | None = None
+) -> dict[str, Any]:
     """Gathers what one sweep's line says.
 
     Args:
       name: of the sweep.
       detections: of one sweep, not a batch.
       min_score: boxes that score less are left out.
+      timestamp_ns: when the sweep was taken, ns since 1970; None where it is unknown.
 
     Returns:
-      ``name``; ``boxes``, best first, each with ``label`` ("car", "van", "truck"), ``score``, ``center``
-      (3, m), ``size`` (3, m: length, width, height), ``yaw`` (rad) and ``num_points``; ``status``, one
-      sentence a bit, empty for a clean run; ``counts``, as `Counts`.
+      ``name``; ``timestamp_ns``, or None; ``boxes``, best first, each with ``label`` ("car", "van",
+      "truck"), ``score``, ``center`` (3, m), ``size`` (3, m: length, width, height), ``yaw`` (rad) and
+      ``num_points``; ``status``, one sentence a bit, empty for a clean run; ``counts``, as `Counts`.
     """
     keep = np.asarray(detections.valid) & (np.asarray(detections.score) >= min_score)
     return {
         "name": name,
+        "timestamp_ns": timestamp_ns,
         "boxes": [_box(detections, int(row)) for row in np.flatnonzero(keep)],
         "status": Status(int(detections.status)).describe(),
         "counts": _counts(detections.counts),
@@ -88,3 +95,48 @@ def _parse_line(line: str, where: str) -> dict[str, Any]:
     if not isinstance(record, dict):
         raise InputError(f"{where}: not a JSON object; each line must be one sweep's {{...}}.")
     return record
+
+
+@contextlib.contextmanager
+def open_jsonl(path: pathlib.Path, resume: bool = False) -> Iterator[WriteResult]:
+    """Opens a JSON Lines file for the results of a run.
+
+    Args:
+      path: the file; its folder is made where it is missing.
+      resume: whether the lines of an earlier file of that name come first.
+
+    Yields:
+      What adds a sweep.
+
+    Raises:
+      InputError: where the earlier file cannot be read.
+    """
+    earlier = read_jsonl(path) if resume and path.is_file() else []
+    with atomic_writer(path) as handle:
+
+        def write(record: Mapping[str, Any]) -> None:
+            handle.write(json.dumps(record, allow_nan=False) + "\n")
+
+        for record in earlier:
+            write(record)
+        yield lambda result: write(result.record)
+
+
+def finished_jsonl(path: pathlib.Path) -> frozenset[str]:
+    """Names of the sweeps that a file of `open_jsonl` holds.
+
+    Args:
+      path: the file; where there is none, it holds none.
+
+    Returns:
+      The names.
+
+    Raises:
+      InputError: where it is no such file.
+    """
+    return (
+        frozenset(str(record.get("name")) for record in read_jsonl(path)) if path.is_file() else frozenset()
+    )
+
+
+JSONL = ResultFile(name="detections.jsonl", open=open_jsonl, finished=finished_jsonl)

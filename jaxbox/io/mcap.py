@@ -33,12 +33,12 @@ def open_mcap(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
       InputError: where it is no such file, or the topic has to be named.
       ImportError: without the extra ``mcap``.
     """
-    with _reader(path) as reader:
+    with open_mcap_reader(path) as reader:
         counts, others = _count_messages(reader)
     chosen = choose_topic(path, topic, counts, others)
 
     def messages() -> Iterator[Message]:
-        with _reader(path) as reader:
+        with open_mcap_reader(path) as reader:
             for schema, channel, message in reader.iter_messages(topics=[chosen]):
                 decoder = _decoder_of(schema, channel)
                 if decoder is not None:
@@ -49,8 +49,19 @@ def open_mcap(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
 
 
 @contextlib.contextmanager
-def _reader(path: pathlib.Path) -> Iterator[Any]:
-    """The file; whatever library and decompressors raise on broken bytes becomes one kind of error."""
+def open_mcap_reader(path: pathlib.Path) -> Iterator[Any]:
+    """Opens an MCAP file; what library and decompressors raise on broken bytes becomes one kind of error.
+
+    Args:
+      path: the file.
+
+    Yields:
+      The library's reader.
+
+    Raises:
+      InputError: naming the file, where it cannot be read.
+      ImportError: without the extra ``mcap``.
+    """
     module = require("mcap.reader", extra="mcap", what="MCAP files")
     try:
         with path.open("rb") as file:

@@ -1,0 +1,140 @@
+"""Detections as an MCAP file that Foxglove plays: boxes, the points where wanted, and the plain records.
+
+Topics: ``/jaxbox/boxes`` (``foxglove.SceneUpdate``), ``/jaxbox/points`` (``foxglove.PointCloud``), both in
+the frame ``lidar``, and ``/jaxbox/detections``, the line that JSON Lines would have, as JSON.
+"""
+
+import contextlib
+import json
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from jaxbox.io._extras import require
+from jaxbox.io._files import InputError, atomic_path
+from jaxbox.io.foxglove import point_cloud, scene_update
+from jaxbox.io.mcap import open_mcap_reader
+from jaxbox.io.results import ResultFile, SweepResult, WriteResult
+
+BOXES_TOPIC = "/jaxbox/boxes"
+"""Topic of the boxes."""
+POINTS_TOPIC = "/jaxbox/points"
+"""Topic of the points."""
+RECORDS_TOPIC = "/jaxbox/detections"
+"""Topic of the records."""
+FRAME_ID = "lidar"
+"""Coordinate frame of boxes and points."""
+
+_RECORD_SCHEMA = {"title": "jaxbox.Detections", "type": "object"}
+
+
+@contextlib.contextmanager
+def open_mcap_results(path: pathlib.Path, resume: bool = False) -> Iterator[WriteResult]:
+    """Opens an MCAP file for the results of a run; see the module for its topics.
+
+    Args:
+      path: the file; its folder is made where it is missing.
+      resume: whether the messages of an earlier file of that name come first.
+
+    Yields:
+      What adds a sweep.
+
+    Raises:
+      InputError: where the earlier file cannot be read.
+      ImportError: without the extra ``mcap``.
+    """
+    module = require("mcap.writer", extra="mcap", what="MCAP files")
+    schemas = require("mcap_protobuf.schema", extra="mcap", what="MCAP files")
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        writer = module.Writer(file)
+        writer.start(library="jaxbox")
+        channels = _Channels(writer, schemas)
+        index = _copy(path, channels) if resume and path.is_file() else 0
+
+        def write(result: SweepResult) -> None:
+            nonlocal index
+            time_ns = result.time_ns(index)
+            common = {"timestamp_ns": time_ns, "frame_id": FRAME_ID}
+            if result.xyz is not None:
+                intensity = np.zeros(len(result.xyz)) if result.intensity is None else result.intensity
+                channels.add_message(POINTS_TOPIC, point_cloud(result.xyz, intensity, **common), time_ns)
+            channels.add_message(BOXES_TOPIC, scene_update(result.record, **common), time_ns)
+            channels.add_record(result.record, time_ns)
+            index += 1
+
+        yield write
+        writer.finish()
+
+
+class _Channels:
+    """The topics of a file, each opened with its first message."""
+
+    def __init__(self, writer: Any, schemas: Any) -> None:
+        self._writer, self._schemas = writer, schemas
+        self._ids: dict[str, int] = {}
+
+    def add_message(self, topic: str, message: Any, time_ns: int) -> None:
+        """Adds a protobuf message."""
+        if topic not in self._ids:
+            schema = self._schemas.register_schema(self._writer, type(message))
+            self._ids[topic] = self._writer.register_channel(topic, "protobuf", schema)
+        self._writer.add_message(self._ids[topic], time_ns, message.SerializeToString(), time_ns)
+
+    def add_record(self, record: Any, time_ns: int) -> None:
+        """Adds a record as JSON."""
+        if RECORDS_TOPIC not in self._ids:
+            schema = json.dumps(_RECORD_SCHEMA).encode()
+            schema = self._writer.register_schema(_RECORD_SCHEMA["title"], "jsonschema", schema)
+            self._ids[RECORDS_TOPIC] = self._writer.register_channel(RECORDS_TOPIC, "json", schema)
+        data = json.dumps(record, allow_nan=False).encode()
+        self._writer.add_message(self._ids[RECORDS_TOPIC], time_ns, data, time_ns)
+
+    def add_raw(self, schema: Any, channel: Any, message: Any) -> None:
+        """Adds a message of another file as it is."""
+        if channel.topic not in self._ids:
+            schema_id = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            self._ids[channel.topic] = self._writer.register_channel(
+                channel.topic, channel.message_encoding, schema_id
+            )
+        self._writer.add_message(
+            self._ids[channel.topic], message.log_time, message.data, message.publish_time
+        )
+
+
+def _copy(path: pathlib.Path, channels: _Channels) -> int:
+    """Copies an earlier file; returns how many sweeps it holds."""
+    count = 0
+    with open_mcap_reader(path) as reader:
+        for schema, channel, message in reader.iter_messages():
+            channels.add_raw(schema, channel, message)
+            count += channel.topic == RECORDS_TOPIC
+    return count
+
+
+def finished_mcap(path: pathlib.Path) -> frozenset[str]:
+    """Names of the sweeps that a file of `open_mcap_results` holds.
+
+    Args:
+      path: the file; where there is none, it holds none.
+
+    Returns:
+      The names, also of sweeps without boxes.
+
+    Raises:
+      InputError: where it is no such file.
+      ImportError: without the extra ``mcap``.
+    """
+    if not path.is_file():
+        return frozenset()
+    with open_mcap_reader(path) as reader:
+        records = [json.loads(message.data) for _, _, message in reader.iter_messages(topics=[RECORDS_TOPIC])]
+    if not records:
+        raise InputError(f"{path}: no MCAP file of jaxbox, as it has no {RECORDS_TOPIC}; move it away.")
+    return frozenset(record["name"] for record in records)
+
+
+MCAP_RESULTS = ResultFile(
+    name="detections.mcap", open=open_mcap_results, finished=finished_mcap, wants_points=True
+)
