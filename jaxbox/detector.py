@@ -1,9 +1,13 @@
 """detect(): from a sweep to vehicle boxes, as one compiled function. Wiring only."""
 
+import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from jaxbox import steps
 from jaxbox.config import DetectorConfig
@@ -57,10 +61,16 @@ def lower(
 
 def _operands(
     cloud: PointCloud, config: DetectorConfig | None, key: jax.Array | None
-) -> tuple[PointCloud, DetectorConfig, jax.Array]:
+) -> tuple[PointCloud, "_Settings", jax.Array]:
     config = DetectorConfig() if config is None else config
     steps.check_settings(config)
-    return cloud, jax.tree.map(_as_float, config), jax.random.key(0) if key is None else key
+    return cloud, _Settings.pack(config), _default_key() if key is None else key
+
+
+@functools.cache
+def _default_key() -> jax.Array:
+    with jax.ensure_compile_time_eval():
+        return jax.random.key(0)
 
 
 def count_compilations() -> int:
@@ -68,9 +78,28 @@ def count_compilations() -> int:
     return _detect_jit._cache_size()  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
 
 
-def _as_float(threshold: Any) -> Any:
-    # jit tells 8 from 8.0 and from a NumPy scalar, and would compile again for each.
-    return threshold if isinstance(threshold, jax.Array) else float(threshold)
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class _Settings:
+    """A configuration whose thresholds are one array: to hand over a hundred takes JAX a millisecond."""
+
+    thresholds: jax.Array | np.ndarray  # (T,) float32
+    structure: Any = dataclasses.field(metadata={"static": True})
+
+    @classmethod
+    def pack(cls, config: DetectorConfig) -> "_Settings":
+        values, structure = jax.tree.flatten(config)
+        traced = {i: jnp.float32(v) for i, v in enumerate(values) if isinstance(v, jax.Array)}
+        known = np.array([0 if i in traced else v for i, v in enumerate(values)], np.float32)
+        if not traced:
+            return cls(known, structure)
+        return cls(
+            jnp.asarray(known).at[np.array(list(traced))].set(jnp.stack(list(traced.values()))), structure
+        )
+
+    def unpack(self) -> DetectorConfig:
+        values = jax.lax.split(jnp.asarray(self.thresholds), [1] * self.structure.num_leaves)
+        return jax.tree.unflatten(self.structure, [jax.lax.squeeze(value, (0,)) for value in values])
 
 
 # A batch runs its sweeps one after the other: on a CPU, batched scatters, and loops that end with the
@@ -78,11 +107,13 @@ def _as_float(threshold: Any) -> Any:
 # that the compiler makes the same code of it in the loop and without, and the batch has the singles' bits.
 @jax.jit
 @jax.custom_batching.sequential_vmap
-def _detect_jit(cloud: PointCloud, config: DetectorConfig, key: jax.Array) -> Detections:
+def _detect_jit(cloud: PointCloud, config: _Settings, key: jax.Array) -> Detections:
     # What a step finds is stored, or the compiler would work it out again in each later step that reads it,
     # and its scratch memory is freed: beyond 32 MB, glibc would return it to the system at each call, and
     # a sixth of the time would go into getting it back page by page.
-    run = functools.partial(apart, proof=cloud.num_points >= 0)
+    def run(step: Callable[..., Any], *inputs: Any) -> Any:
+        return apart(_with_settings(step), *inputs, proof=cloud.num_points >= 0)
+
     # 3.1 Statistical filtering, and ground removal by RANSAC (Algorithm I).
     sweep = run(steps.select_points, cloud, config)
     heights = run(steps.remove_ground, sweep, config, key)
@@ -97,3 +128,10 @@ def _detect_jit(cloud: PointCloud, config: DetectorConfig, key: jax.Array) -> De
     # Vehicle decision: score, suppression, and (3.5) the descriptors of what is left.
     candidates = run(steps.score_boxes, trials, boxes, proposals, obstacles, heights, seen, config)
     return run(steps.conclude, cloud, sweep, heights, obstacles, proposals, fits, candidates, config)
+
+
+def _with_settings(step: Callable[..., Any]) -> Callable[..., Any]:
+    def call(*inputs: Any) -> Any:
+        return step(*[each.unpack() if isinstance(each, _Settings) else each for each in inputs])
+
+    return call

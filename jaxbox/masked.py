@@ -176,10 +176,11 @@ def apart(function: Callable[..., Any], *operands: Any, proof: jax.Array) -> Any
     Returns:
       The function's result, or zeros where `proof` is False.
     """
-    shapes = jax.eval_shape(function, *operands)
+    traced_once = jax.jit(function, inline=True)
+    shapes = jax.eval_shape(traced_once, *operands)
     return jax.lax.cond(
         proof,
-        lambda: function(*operands),
+        lambda: traced_once(*operands),
         lambda: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes),
     )
 
