@@ -20,7 +20,10 @@ from jaxbox.evaluation.objectives import OBJECTIVES
 from jaxbox.io import InputError
 from jaxbox.version import __version__
 
-PresetOption = Annotated[str, typer.Option(help="Settings: default, or paper for the paper's choices.")]
+PresetOption = Annotated[
+    str,
+    typer.Option(help="Settings: default, fast, or paper for the paper's choices."),
+]
 SettingsOption = Annotated[
     pathlib.Path | None,
     typer.Option(help="JSON file of changed settings by name, such as best.json of `tune`."),
