@@ -332,9 +332,10 @@ def _ray_fan(center: jax.Array, half_l: jax.Array, half_w: jax.Array, yaw: jax.A
     x, y = center[:, 0], center[:, 1]
     u, v = x * cos + y * sin, y * cos - x * sin
     # The azimuths of the corners, from that of the centre on.
-    corners = [(u + a * half_l, v + b * half_w) for a in (-1, 1) for b in (-1, 1)]
-    spread = [_arctan2(u * cv - v * cu, u * cu + v * cv) for cu, cv in corners]
-    low, high = functools.reduce(jnp.minimum, spread), functools.reduce(jnp.maximum, spread)
+    corner_u = u + jnp.array([-1.0, -1.0, 1.0, 1.0])[:, None] * half_l
+    corner_v = v + jnp.array([-1.0, 1.0, -1.0, 1.0])[:, None] * half_w
+    spread = _arctan2(u * corner_v - v * corner_u, u * corner_u + v * corner_v)
+    low, high = jnp.min(spread, axis=0), jnp.max(spread, axis=0)
     azimuth = _arctan2(y, x) + (low + high) / 2
     along, across = jnp.cos(azimuth - yaw), jnp.sin(azimuth - yaw)
     return azimuth, (high - low) / 2, along, across, u, v, half_l, half_w
