@@ -89,7 +89,7 @@ def detected(kitti_folder, tmp_path_factory):
 def test_detect_writes_a_result_file_and_pictures_a_sweep(detected):
     output, _ = detected
     names = sorted(str(path.relative_to(output)) for path in output.rglob("*") if path.is_file())
-    expected = ["detections.jsonl"]
+    expected = ["config.toml", "detections.jsonl", "run.json"]
     for name in ("000000", "000001"):
         expected += [f"{name}.txt", f"pictures/{name}_boxes.png", f"pictures/{name}_lidar.png"]
     assert names == sorted(expected)
@@ -244,7 +244,9 @@ def test_one_broken_sweep_is_reported_and_the_others_are_done(kitti_folder, tmp_
     assert "000000.bin" in result.stderr
     assert "16" in result.stderr
     assert "1 sweeps done, 1 failed" in result.stdout
-    assert [path.name for path in output.iterdir()] == ["000001.txt"]
+    assert sorted(path.name for path in output.iterdir()) == ["000001.txt", "config.toml", "run.json"]
+    account = json.loads((output / "run.json").read_text())
+    assert (account["num_done"], account["failures"][0]["sweep"]) == (1, "000000")
 
 
 def test_a_broken_sweep_leaves_an_earlier_result_whole(kitti_folder, detected, tmp_path):
@@ -279,7 +281,8 @@ def test_sweeps_without_a_camera_are_written_as_json_lines(tmp_path):
     result = run("detect", tmp_path / "sweeps", "--output", output, "--no-pictures", "--min-score", "0.01")
     assert result.exit_code == 0, result.output
     assert "no camera calibration" in result.stderr
-    assert [path.name for path in output.iterdir()] == ["detections.jsonl"]
+    names = ["config.toml", "detections.jsonl", "run.json"]
+    assert sorted(path.name for path in output.iterdir()) == names
     records = read_jsonl(output / "detections.jsonl")
     scores = [box["score"] for record in records for box in record["boxes"]]
     assert [record["name"] for record in records] == ["0", "1"]

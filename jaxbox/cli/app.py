@@ -14,6 +14,7 @@ from jaxbox.cli.export import Platform, run_export
 from jaxbox.cli.info import print_info
 from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.cli.settings import chosen_config
+from jaxbox.cli.sweep_info import print_sweep_info
 from jaxbox.cli.tune import TuneOptions, run_tune
 from jaxbox.evaluation.copies import COPIES
 from jaxbox.evaluation.objectives import OBJECTIVES
@@ -21,12 +22,18 @@ from jaxbox.io import InputError
 from jaxbox.version import __version__
 
 PresetOption = Annotated[
-    str,
-    typer.Option(help="Settings: default, fast, or paper for the paper's choices."),
+    str | None,
+    typer.Option(
+        help="Settings to start from: default, fast, or paper for the paper's choices; `default` unless given."
+    ),
 ]
 SettingsOption = Annotated[
     pathlib.Path | None,
-    typer.Option(help="JSON file of changed settings by name, such as best.json of `tune`."),
+    typer.Option(
+        "--config",
+        "--settings",
+        help="Settings file: TOML, or JSON such as best.json of `tune`; docs/settings.md.",
+    ),
 ]
 SetOption = Annotated[
     list[str] | None,
@@ -37,16 +44,29 @@ DrivesOption = Annotated[
 ]
 
 EXIT_CODES = (
-    "Exit codes: 0 all went well; 1 some sweeps failed, the others are done; "
+    "Exit codes: 0 all went well; 1 some sweeps failed or it was interrupted, the others are done; "
     "2 the input or an option cannot be used."
 )
+
+DETECT_EXAMPLES = """Examples:
+
+jaxbox detect KITTI/training --output out
+
+jaxbox detect drive.bag --topic /velodyne_points --output out --format mcap
+
+jaxbox detect 'clouds/*.pcd' --output out --format parquet --format jsonl --no-pictures
+
+jaxbox detect drive.mcap --output out --format parquet --resume
+
+jaxbox detect sweep.pcd --output out --config my.toml --set vehicles.min_score=0.1 --json
+
+"""
 
 app = typer.Typer(
     name="jaxbox",
     help="Training-free LiDAR vehicle detection: sweeps in, oriented 3D boxes out.",
     epilog=EXIT_CODES,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
@@ -82,20 +102,26 @@ def demo(
         run_demo(output, seed=seed, console=stdout())
 
 
-@app.command(epilog=EXIT_CODES)
+@app.command(epilog=DETECT_EXAMPLES + EXIT_CODES)
 def detect(
-    path: Annotated[
-        pathlib.Path,
-        typer.Argument(help="A KITTI folder (object, raw or tracking), a folder of sweeps, or one sweep."),
+    paths: Annotated[
+        list[str],
+        typer.Argument(
+            help="Sweeps (.bin .pcd.bin .pcd .ply .las .laz .npy .npz .feather .txt .csv .xyz), recordings "
+            "(.bag .db3 .mcap, ROS 2 folders), folders of them, data sets' folders, or patterns in quotes; "
+            "docs/formats.md.",
+        ),
     ],
     *,
     output: Annotated[pathlib.Path, typer.Option(help="Folder for results and pictures.")],
-    preset: PresetOption = "default",
+    preset: PresetOption = None,
     settings: SettingsOption = None,
     changes: SetOption = None,
     result_format: Annotated[
-        ResultFormat, typer.Option("--format", help="KITTI text files, one JSON Lines file, or both.")
-    ] = ResultFormat.KITTI,
+        list[ResultFormat] | None,
+        typer.Option("--format", help="What to write; repeatable. both: kitti and jsonl. By default kitti."),
+    ] = None,
+    topic: Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")] = None,
     capacity: Annotated[
         int | None,
         typer.Option(min=1, help="Points a sweep is padded to; by default what it needs. One compile each."),
@@ -109,25 +135,38 @@ def detect(
             f"pictures and counts never show less than {SHOWN_MIN_SCORE:g}.",
         ),
     ] = 0.0,
+    points: Annotated[bool, typer.Option(help="Put the points into MCAP and rerun files too.")] = True,
     pictures: Annotated[bool, typer.Option(help="Draw pictures of each sweep.")] = True,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Pass over sweeps whose results in OUTPUT are complete.")
+    ] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="Print only what went wrong.")] = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object a sweep, and a summary, for scripts.")
+    ] = False,
 ) -> None:
     """Detect vehicles in real sweeps: writes result files and pictures.
 
-    Results are OUTPUT/NAME.txt (KITTI) or OUTPUT/detections.jsonl (JSON Lines), pictures
-    OUTPUT/pictures/NAME_*.png. A broken sweep is reported and the others go on.
+    Results are OUTPUT/NAME.txt (kitti) or OUTPUT/detections.jsonl, .parquet, .mcap (for Foxglove) and .rrd
+    (for rerun), pictures OUTPUT/pictures/NAME_*.png. Every file is written whole or not at all. The exact
+    settings are in OUTPUT/config.toml, versions and failures in OUTPUT/run.json. A broken sweep is reported
+    and the others go on.
     """
     with input_errors():
         options = DetectOptions(
             output=output,
             config=chosen_config(preset, settings, changes or []),
-            result_format=result_format,
+            formats=frozenset(result_format or [ResultFormat.KITTI]),
+            topic=topic,
             capacity=capacity,
             min_score=min_score,
+            points=points,
             pictures=pictures,
+            resume=resume,
             quiet=quiet,
+            json=json,
         )
-        raise typer.Exit(run_detect(path, options))
+        raise typer.Exit(run_detect(paths, options))
 
 
 @app.command("eval", epilog=EXIT_CODES)
@@ -191,7 +230,7 @@ def tune(
     ] = 4,
     objective: Annotated[str, typer.Option(help=f"One of {', '.join(OBJECTIVES)}; moderate R40.")] = "soft",
     drives: DrivesOption = None,
-    preset: PresetOption = "default",
+    preset: PresetOption = None,
     settings: SettingsOption = None,
     changes: SetOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Another number tries other settings.")] = 0,
@@ -207,8 +246,8 @@ def tune(
             raise InputError(f"--objective {objective}: choose one of {', '.join(OBJECTIVES)}.")
         options = TuneOptions(
             output=output,
-            preset=preset,
-            config=chosen_config(preset, settings, changes or []),
+            preset=preset or "default",
+            config=chosen_config(preset or "default", settings, changes or []),
             search=search or [],
             trials=trials,
             refine=refine,
@@ -225,7 +264,7 @@ def export(
     *,
     output: Annotated[pathlib.Path, typer.Option(help="Folder for the files.")],
     capacity: Annotated[int, typer.Option(min=1, help="Points that a sweep is padded to.")] = 2**17,
-    preset: PresetOption = "default",
+    preset: PresetOption = None,
     settings: SettingsOption = None,
     changes: SetOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the random key inside.")] = 0,
@@ -244,6 +283,24 @@ def export(
 
 
 @app.command(epilog=EXIT_CODES)
-def info() -> None:
-    """Print versions, devices and presets."""
-    print_info(stdout())
+def info(
+    paths: Annotated[
+        list[str] | None, typer.Argument(help="What `detect` takes; none for versions and presets.")
+    ] = None,
+    *,
+    topic: Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")] = None,
+    num_sweeps: Annotated[
+        int, typer.Option("--sweeps", min=1, help="Sweeps to look at, spread over all there are.")
+    ] = 1,
+    json: Annotated[bool, typer.Option("--json", help="Print JSON, for scripts.")] = False,
+) -> None:
+    """Say what a sweep looks like, and which settings fit it; or print versions, devices and presets.
+
+    Points, range, height, beams, missing values, the sensor's height and tilt, and the capacities that
+    sweeps like these need, as a settings file for --config.
+    """
+    with input_errors():
+        if paths:
+            print_sweep_info(paths, topic=topic, num_sweeps=num_sweeps, as_json=json, console=stdout())
+        else:
+            print_info(stdout(), as_json=json)

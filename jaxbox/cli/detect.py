@@ -1,10 +1,10 @@
-"""``jaxbox detect``: sweeps of a folder to result files and pictures, one after the other."""
+"""``jaxbox detect``: sweeps of files, folders and recordings to result files and pictures, one by one."""
 
 import dataclasses
-import enum
+import json
 import pathlib
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import jax
 import numpy as np
@@ -19,15 +19,16 @@ from jaxbox.cli.report import (
     describe_frame,
     describe_run,
 )
+from jaxbox.cli.results import ResultFormat, Results, RunAccount
 from jaxbox.cli.timing import TimedDetector
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation.iou import image_fractions
+from jaxbox.io.jsonl import JSONL
 from jaxbox.projection import project_boxes
 from jaxbox.types import Calibration, Detections, PointCloud
 from jaxbox.viz import BoxSet, draw_stages, save_png
 
 PICTURE_FOLDER = "pictures"
-JSONL_NAME = "detections.jsonl"
 SHOWN_PICTURES = ("boxes", "lidar", "image")
 """Of the pictures of the stages, those that show the answer."""
 VEHICLE_TYPES = ("Car", "Van", "Truck")
@@ -35,14 +36,6 @@ DONT_CARE_SHARE = 0.5
 """A box with a larger share of its 2D box in one DontCare region is not judged."""
 
 _project_boxes = jax.jit(project_boxes)
-
-
-class ResultFormat(enum.StrEnum):
-    """What `detect` writes."""
-
-    KITTI = "kitti"
-    JSONL = "jsonl"
-    BOTH = "both"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -53,84 +46,155 @@ class DetectOptions:
     """Folder for results and pictures."""
     config: DetectorConfig
     """The detector's settings."""
-    result_format: ResultFormat
+    formats: frozenset[ResultFormat]
     """What to write."""
+    topic: str | None
+    """Topic of the points in recordings."""
     capacity: int | None
     """Points a sweep is padded to, or None for what it needs."""
     min_score: float
     """Lower scores are left out."""
+    points: bool
+    """Whether MCAP and rerun files hold the points too."""
     pictures: bool
     """Whether pictures are drawn."""
+    resume: bool
+    """Whether sweeps with complete results are passed over."""
     quiet: bool
     """Whether only errors are printed."""
+    json: bool
+    """Whether stdout is JSON Lines."""
+
+    @property
+    def speaks(self) -> bool:
+        """Whether sentences are printed."""
+        return not (self.quiet or self.json)
 
 
-def run_detect(path: pathlib.Path, options: DetectOptions) -> ExitCode:
-    """Detects in every sweep below a path; a broken one is reported and the others go on.
+def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
+    """Detects in every sweep of some paths; a broken one is reported and the others go on.
+
+    Interrupted, it closes its files, so that what is done is whole and can be resumed.
 
     Args:
-      path: what `jaxbox.io.open_sweeps` takes.
+      paths: what `jaxbox.io.open_sweeps` takes.
       options: the command's options.
 
     Returns:
-      `ExitCode.FRAME_FAILED` where a sweep failed.
+      `ExitCode.FRAME_FAILED` where a sweep failed, or it was interrupted.
 
     Raises:
-      InputError: where the path holds no sweeps.
+      InputError: where a path holds no sweeps, or the options cannot be used.
     """
-    sweeps = io.open_sweeps(path)
+    sweeps = io.open_sweeps(paths, topic=options.topic)
     options.output.mkdir(parents=True, exist_ok=True)
+    account = RunAccount(
+        output=options.output,
+        config=options.config,
+        options={"min_score": options.min_score, "capacity": options.capacity, "topic": options.topic},
+        inputs=tuple(paths),
+    )
+    if options.resume:
+        account.check_resumable()
     detector = TimedDetector(options.config)
     run = RunReport()
-    try:
-        with make_progress(shown=not options.quiet) as progress:
+    with Results(
+        options.output,
+        options.formats,
+        resume=options.resume,
+        min_score=options.min_score,
+        points=options.points,
+    ) as results:
+        account.write(finished=False)
+        _run_sweeps(sweeps, detector, options, run, results)
+    account.write(
+        finished=not (run.interrupted or run.failures),
+        interrupted=run.interrupted,
+        num_done=len(run.frames),
+        num_skipped=run.num_skipped,
+        failures=[{"sweep": name, "reason": reason} for name, reason in run.failures],
+    )
+    _report(run, results, detector, options)
+    return ExitCode.FRAME_FAILED if run.failures or run.interrupted else ExitCode.OK
+
+
+def _run_sweeps(
+    sweeps: Sequence[io.Sweep],
+    detector: TimedDetector,
+    options: DetectOptions,
+    run: RunReport,
+    results: Results,
+) -> None:
+    """Every sweep; ends early, with what is done, where it is interrupted or a recording breaks off."""
+    with make_progress(shown=options.speaks) as progress:
+        try:
             for sweep in progress.track(sweeps, description="detecting"):
-                _run_frame(sweep, detector, options, run)
-    finally:
-        # Also when interrupted: what is done is not lost.
-        if run.records:
-            io.write_jsonl(options.output / JSONL_NAME, run.records)
-    _note_missing_cameras(run, options)
-    if not options.quiet:
-        for line in describe_run(run, detector.compile_s):
-            stdout().print(line, markup=False)
-    return ExitCode.FRAME_FAILED if run.failures else ExitCode.OK
+                if results.is_finished(sweep.name):
+                    run.num_skipped += 1
+                else:
+                    _run_frame(sweep, detector, options, run, results)
+        except io.InputError as error:
+            run.failures.append(("the recording", str(error)))
+            print_error(str(error))
+        except KeyboardInterrupt:
+            run.interrupted = True
 
 
-def _note_missing_cameras(run: RunReport, options: DetectOptions) -> None:
-    if run.without_camera:
-        first, count = run.without_camera[0], len(run.without_camera)
+def _report(run: RunReport, results: Results, detector: TimedDetector, options: DetectOptions) -> None:
+    """The end of the run, in sentences or as the last line of JSON."""
+    if run.interrupted:
+        stderr().print("interrupted; the same command with --resume goes on.", markup=False)
+    if results.without_camera:
+        first, count = results.without_camera[0], len(results.without_camera)
         stderr().print(
             f"{count} sweeps have no camera calibration (the first is {first}); KITTI text needs one, so "
-            f"their boxes are in {options.output / JSONL_NAME} instead.",
+            f"their boxes are in {options.output / JSONL.name} instead.",
             markup=False,
         )
+    if options.json:
+        failures = [{"sweep": name, "reason": reason} for name, reason in run.failures]
+        counts = {"done": len(run.frames), "skipped": run.num_skipped, "interrupted": run.interrupted}
+        _print_json({"summary": {**counts, "failures": failures}})
+    elif options.speaks:
+        for line in describe_run(run, detector.compile_s):
+            stdout().print(line, markup=False)
 
 
-def _run_frame(sweep: io.Sweep, detector: TimedDetector, options: DetectOptions, run: RunReport) -> None:
+def _print_json(value: dict) -> None:
+    stdout().out(json.dumps(value, allow_nan=False), highlight=False)
+
+
+def _run_frame(
+    sweep: io.Sweep, detector: TimedDetector, options: DetectOptions, run: RunReport, results: Results
+) -> None:
     """One sweep, its files and its lines; a failure is added to the run."""
     try:
-        report = _process(sweep, detector, options, run)
+        report = _process(sweep, detector, options, results)
     except (io.InputError, OSError) as error:
         run.failures.append((sweep.name, str(error)))
         print_error(f"sweep {sweep.name}: {error}")
         return
     run.frames.append(FrameOutcome.of(report))
-    if not options.quiet:
+    if options.speaks:
         for line in describe_frame(report, min_score=max(SHOWN_MIN_SCORE, options.min_score)):
             stdout().print(line, markup=False)
 
 
-def _process(sweep: io.Sweep, detector: TimedDetector, options: DetectOptions, run: RunReport) -> FrameReport:
+def _process(
+    sweep: io.Sweep, detector: TimedDetector, options: DetectOptions, results: Results
+) -> FrameReport:
     """Reads, detects, writes and draws; results are written before the pictures are tried."""
     start = time.perf_counter()
     xyz, intensity = sweep.read_points()
     calibration = sweep.read_calibration()
+    image = sweep.read_image() if results.wants_image else None
     cloud = PointCloud.from_numpy(xyz, intensity, capacity=options.capacity)
     reading_s = time.perf_counter() - start
     detections, detect_s = detector(cloud)
     start = time.perf_counter()
-    _write_results(sweep.name, detections, calibration, options, run)
+    record = results.write(sweep, detections, calibration=calibration, points=(xyz, intensity), image=image)
+    if options.json:
+        _print_json({**record, "num_points": len(xyz), "detect_ms": round(detect_s * 1e3, 3)})
     if options.pictures:
         _write_pictures(sweep, cloud, detections, calibration, options)
     return FrameReport(
@@ -140,20 +204,6 @@ def _process(sweep: io.Sweep, detector: TimedDetector, options: DetectOptions, r
         detect_s=detect_s,
         other_s=reading_s + time.perf_counter() - start,
     )
-
-
-def _write_results(
-    name: str, detections: Detections, calibration: Calibration | None, options: DetectOptions, run: RunReport
-) -> None:
-    """KITTI text where there is a camera; JSON Lines where asked for, or where there is none."""
-    wants_text = options.result_format is not ResultFormat.JSONL
-    if wants_text and calibration is not None:
-        objects = io.objects_from_detections(detections, calibration, min_score=options.min_score)
-        io.write_labels(options.output / f"{name}.txt", objects)
-    if wants_text and calibration is None:
-        run.without_camera.append(name)
-    if options.result_format is not ResultFormat.KITTI or calibration is None:
-        run.records.append(io.detections_record(name, detections, min_score=options.min_score))
 
 
 def _write_pictures(

@@ -1,42 +1,40 @@
 """``jaxbox info``: versions, devices and presets."""
 
-import importlib.metadata
-import platform
+import json
 
 import jax
 from rich.console import Console
 from rich.table import Table
 
 from jaxbox.cli.cache import CACHE_VARIABLE, enable_cache
+from jaxbox.cli.versions import versions
 from jaxbox.config import DetectorConfig
 from jaxbox.padding import CAPACITY_BUCKETS
-from jaxbox.version import __version__
-
-PACKAGES = ("jax", "jaxlib", "numpy", "opencv-python-headless", "chex", "matplotlib", "scipy")
 
 
-def print_info(console: Console) -> None:
-    """Prints versions, devices, the cache folder, the capacities and what the presets choose."""
-    versions = Table("package", "version", title="versions")
-    versions.add_row("jaxbox", __version__)
-    versions.add_row("python", platform.python_version())
-    for package in PACKAGES:
-        versions.add_row(package, _version(package))
-    console.print(versions)
-    console.print(f"devices: {', '.join(str(device) for device in jax.devices())}")
+def print_info(console: Console, *, as_json: bool = False) -> None:
+    """Prints versions, devices, the cache folder, the capacities and what the presets choose.
+
+    Args:
+      console: where it goes.
+      as_json: whether JSON is printed.
+    """
+    devices, presets = [str(device) for device in jax.devices()], DetectorConfig.presets()
+    if as_json:
+        found = {"versions": versions(formats=True), "devices": devices, "presets": list(presets)}
+        console.out(json.dumps(found), highlight=False)
+        return
+    table = Table("package", "version", title="versions")
+    for package, version in versions(formats=True).items():
+        table.add_row(package, version)
+    console.print(table)
+    console.print(f"devices: {', '.join(devices)}")
     console.print(f"compiled functions: {enable_cache() or 'not kept'} (set {CACHE_VARIABLE} to change)")
     console.print(f"point capacities: {', '.join(str(bucket) for bucket in CAPACITY_BUCKETS)}")
-    presets = Table("preset", "ground", "maps", "rectangle", "completion", title="presets")
-    for name, config in DetectorConfig.presets().items():
-        presets.add_row(name, *_describe_preset(config))
-    console.print(presets)
-
-
-def _version(package: str) -> str:
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
+    table = Table("preset", "ground", "maps", "rectangle", "completion", title="presets")
+    for name, config in presets.items():
+        table.add_row(name, *_describe_preset(config))
+    console.print(table)
 
 
 def _describe_preset(config: DetectorConfig) -> list[str]:

@@ -3,7 +3,6 @@
 import dataclasses
 from collections import Counter
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from rich.table import Table
@@ -56,10 +55,10 @@ class RunReport:
     """Those that went through."""
     failures: list[tuple[str, str]] = dataclasses.field(default_factory=list)
     """Name and reason of those that did not."""
-    without_camera: list[str] = dataclasses.field(default_factory=list)
-    """Names of those that KITTI text was asked for but that have no calibration."""
-    records: list[dict[str, Any]] = dataclasses.field(default_factory=list)
-    """What goes to the JSON Lines file."""
+    num_skipped: int = 0
+    """Sweeps that an earlier run had finished."""
+    interrupted: bool = False
+    """Whether the run was ended before its last sweep."""
 
 
 def describe_frame(report: FrameReport, *, min_score: float = SHOWN_MIN_SCORE) -> list[str]:
@@ -101,7 +100,8 @@ def describe_run(run: RunReport, compile_s: dict[int, float]) -> list[str]:
     Returns:
       A few lines.
     """
-    lines = [f"{len(run.frames)} sweeps done, {len(run.failures)} failed"]
+    skipped = f", {run.num_skipped} done before" if run.num_skipped else ""
+    lines = [f"{len(run.frames)} sweeps done, {len(run.failures)} failed{skipped}"]
     if compile_s:
         parts = ", ".join(f"{seconds:.1f} s for {capacity} points" for capacity, seconds in compile_s.items())
         lines.append(f"compiled (or loaded from the cache) once: {parts}")

@@ -4,6 +4,7 @@ The `mcap` library finds the messages; those of ROS are decoded as in `jaxbox.io
 """
 
 import contextlib
+import functools
 import pathlib
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -107,7 +108,7 @@ def _decoder_of(schema: Any, channel: Any) -> Callable[[bytes, str], Callable[[]
         is_ros1 = channel.message_encoding == "ros1"
         return lambda data, where: MessageDecoder(data, where, is_ros1)
     if name == POINT_CLOUD and channel.message_encoding == "protobuf":
-        return lambda data, where: lambda: decode_point_cloud(data, where)
+        return lambda data, where: functools.partial(decode_point_cloud, data, where)
     return None
 
 

@@ -1,0 +1,189 @@
+"""What `jaxbox detect` writes: the formats, which sweeps are done already, and the account of the run."""
+
+import contextlib
+import dataclasses
+import datetime
+import enum
+import json
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from jaxbox import io
+from jaxbox.cli.versions import versions
+from jaxbox.config import DetectorConfig
+from jaxbox.io.jsonl import JSONL
+from jaxbox.io.mcap_results import MCAP_RESULTS
+from jaxbox.io.parquet import PARQUET
+from jaxbox.io.rerun import RERUN
+from jaxbox.io.results import ResultFile, SweepResult, WriteResult
+from jaxbox.settings import changed_settings
+from jaxbox.types import Calibration, Detections
+
+CONFIG_NAME = "config.toml"
+"""The exact settings, beside the results."""
+RUN_NAME = "run.json"
+"""Versions, options and outcome, beside the results."""
+
+
+class ResultFormat(enum.StrEnum):
+    """What `detect` writes."""
+
+    KITTI = "kitti"
+    JSONL = "jsonl"
+    BOTH = "both"
+    PARQUET = "parquet"
+    MCAP = "mcap"
+    RERUN = "rerun"
+
+
+FILES: Mapping[ResultFormat, ResultFile] = {
+    ResultFormat.JSONL: JSONL,
+    ResultFormat.PARQUET: PARQUET,
+    ResultFormat.MCAP: MCAP_RESULTS,
+    ResultFormat.RERUN: RERUN,
+}
+"""Formats of one file a run; KITTI text is one a sweep."""
+
+
+class Results:
+    """The result files of a run, as a context: they take their names when it ends."""
+
+    def __init__(
+        self,
+        output: pathlib.Path,
+        formats: frozenset[ResultFormat],
+        *,
+        resume: bool,
+        min_score: float,
+        points: bool,
+    ) -> None:
+        """Looks at what an earlier run left, where it is to be resumed.
+
+        Raises:
+          InputError: where a format cannot be continued, or an earlier file cannot be read.
+        """
+        self._output, self._min_score, self._resume, self._points = output, min_score, resume, points
+        self._kitti = bool(formats & {ResultFormat.KITTI, ResultFormat.BOTH})
+        if ResultFormat.BOTH in formats:
+            formats |= {ResultFormat.JSONL}
+        self._files = [FILES[name] for name in FILES if name in formats]
+        self._finished = {file.name: self._look(file) for file in {JSONL, *self._files}} if resume else {}
+        self._open: dict[str, WriteResult] = {}
+        self._stack = contextlib.ExitStack()
+        self.without_camera: list[str] = []
+
+    def _look(self, file: ResultFile) -> frozenset[str]:
+        if file.finished is None:
+            raise io.InputError(f"{file.name} cannot be continued; leave out --resume, or its --format.")
+        return file.finished(self._output / file.name)
+
+    def __enter__(self) -> "Results":
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self._stack.__exit__(*error)
+
+    @property
+    def wants_image(self) -> bool:
+        """Whether a format holds the camera's image."""
+        return RERUN in self._files
+
+    def is_finished(self, name: str) -> bool:
+        """Whether every format holds a sweep already, from the run that is resumed."""
+        if not self._resume:
+            return False
+        text = not self._kitti or self._text_path(name).is_file() or name in self._finished[JSONL.name]
+        return text and all(name in self._finished[file.name] for file in self._files)
+
+    def write(
+        self,
+        sweep: io.Sweep,
+        detections: Detections,
+        *,
+        calibration: Calibration | None,
+        points: tuple[np.ndarray, np.ndarray],
+        image: np.ndarray | None,
+    ) -> Mapping[str, Any]:
+        """Adds a sweep to every file: KITTI text where there is a camera, or JSON Lines in its place.
+
+        Returns:
+          What JSON Lines say of it.
+        """
+        record = io.detections_record(
+            sweep.name, detections, min_score=self._min_score, timestamp_ns=sweep.timestamp_ns
+        )
+        files = list(self._files)
+        if self._kitti and calibration is not None:
+            objects = io.objects_from_detections(detections, calibration, min_score=self._min_score)
+            io.write_labels(self._text_path(sweep.name), objects)
+        elif self._kitti:
+            self.without_camera.append(sweep.name)
+            files += [] if JSONL in files else [JSONL]
+        for file in files:
+            xyz, intensity = points if file.wants_points and self._points else (None, None)
+            result = SweepResult(
+                record=record, xyz=xyz, intensity=intensity, calibration=calibration, image=image
+            )
+            if sweep.name not in self._finished.get(file.name, ()):
+                self._writer(file)(result)
+        return record
+
+    def _writer(self, file: ResultFile) -> WriteResult:
+        # Opened with its first sweep: a run without any leaves an earlier file as it was.
+        if file.name not in self._open:
+            context = file.open(self._output / file.name, self._resume)
+            self._open[file.name] = self._stack.enter_context(context)
+        return self._open[file.name]
+
+    def _text_path(self, name: str) -> pathlib.Path:
+        return self._output / f"{name}.txt"
+
+
+@dataclasses.dataclass
+class RunAccount:
+    """The account of a run, beside its results: `CONFIG_NAME` and `RUN_NAME`."""
+
+    output: pathlib.Path
+    """Folder of the results."""
+    config: DetectorConfig
+    """The detector's settings."""
+    options: Mapping[str, Any]
+    """Other options that the results depend on, as JSON can hold them."""
+    inputs: tuple[str, ...]
+    """Paths that were given."""
+
+    def check_resumable(self) -> None:
+        """Refuses to go on with other settings than those of the results that are there.
+
+        Raises:
+          InputError: naming what differs.
+        """
+        if not (self.output / CONFIG_NAME).is_file():
+            return
+        earlier = io.read_config(self.output / CONFIG_NAME, base=self.config)
+        differing = list(changed_settings(earlier, self.config))
+        with contextlib.suppress(ValueError, TypeError, KeyError, io.InputError):
+            options = json.loads((self.output / RUN_NAME).read_text("utf-8"))["options"]
+            differing += [name for name, value in self.options.items() if options[name] != value]
+        if differing:
+            raise io.InputError(
+                f"{self.output / CONFIG_NAME}: --resume needs the settings of the earlier run, and "
+                f"{', '.join(differing)} differ. Give that file with --config, and the options in "
+                f"{RUN_NAME}, or another --output."
+            )
+
+    def write(self, **outcome: Any) -> None:
+        """Writes the two files; before the run without an outcome, and after it."""
+        io.write_config(self.output / CONFIG_NAME, self.config)
+        account = {
+            "versions": versions(),
+            "inputs": list(self.inputs),
+            "options": dict(self.options),
+            "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            **outcome,
+        }
+        with io.atomic_writer(self.output / RUN_NAME) as handle:
+            handle.write(json.dumps(account, indent=2) + "\n")
