@@ -23,9 +23,7 @@ from jaxbox.version import __version__
 
 PresetOption = Annotated[
     str | None,
-    typer.Option(
-        help="Settings to start from: default, fast, or paper for the paper's choices; `default` unless given."
-    ),
+    typer.Option(help="Settings to start from: default, fast, or paper for the paper's choices."),
 ]
 SettingsOption = Annotated[
     pathlib.Path | None,
