@@ -237,7 +237,7 @@ def tune(
 
     Thresholds are traced: every trial runs in one compiled program. Each drive is scored with the setting
     that the other drives chose. Interrupted, it reports what is done and ends with exit code 1. Use the
-    result with `jaxbox detect --settings OUTPUT/best.json`.
+    result with `jaxbox detect --config OUTPUT/best.json`.
     """
     with input_errors():
         if objective not in OBJECTIVES:
