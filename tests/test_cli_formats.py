@@ -1,6 +1,8 @@
 """`jaxbox detect` and `info` on other formats: what is written, resumed, interrupted and told to scripts."""
 
 import json
+import os
+import signal
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -142,13 +144,16 @@ def test_resume_with_other_settings_or_a_file_that_cannot_be_continued_is_refuse
     assert "detections.rrd cannot be continued" in result.stderr
 
 
-def test_interrupted_the_files_are_whole_and_the_rest_can_be_resumed(sweeps, written, tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_interrupted_the_files_are_whole_and_the_rest_can_be_resumed(
+    sweeps, written, tmp_path, monkeypatch, number
+):
     paths = sorted(sweeps.iterdir())
     read = io.Sweep.read_points
 
     def interrupted(self):
         if self.name == "b":
-            raise KeyboardInterrupt
+            os.kill(os.getpid(), number)
         return read(self)
 
     with monkeypatch.context() as patch:

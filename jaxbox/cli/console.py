@@ -2,7 +2,9 @@
 
 import contextlib
 import enum
+import signal
 import sys
+import threading
 from collections.abc import Iterator
 
 import typer
@@ -61,6 +63,19 @@ class _Rate(ProgressColumn):
     def render(self, task: Task) -> Text:
         """One number once there is one."""
         return Text("" if task.speed is None else f"{task.speed:.1f}/s")
+
+
+@contextlib.contextmanager
+def stoppable() -> Iterator[None]:
+    """Makes SIGTERM, by which schedulers end a job, the same as Ctrl-C: a KeyboardInterrupt."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def make_progress(*, shown: bool) -> Progress:

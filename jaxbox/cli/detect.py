@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from jaxbox import io
-from jaxbox.cli.console import ExitCode, make_progress, print_error, stderr, stdout
+from jaxbox.cli.console import ExitCode, make_progress, print_error, stderr, stdout, stoppable
 from jaxbox.cli.report import (
     SHOWN_MIN_SCORE,
     FrameOutcome,
@@ -74,7 +74,7 @@ class DetectOptions:
 def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
     """Detects in every sweep of some paths; a broken one is reported and the others go on.
 
-    Interrupted, it closes its files, so that what is done is whole and can be resumed.
+    Interrupted (Ctrl-C or SIGTERM), it closes its files, so that what is done is whole and can be resumed.
 
     Args:
       paths: what `jaxbox.io.open_sweeps` takes.
@@ -126,7 +126,7 @@ def _run_sweeps(
     results: Results,
 ) -> None:
     """Every sweep; ends early, with what is done, where it is interrupted or a recording breaks off."""
-    with make_progress(shown=options.speaks) as progress:
+    with stoppable(), make_progress(shown=options.speaks) as progress:
         try:
             for sweep in progress.track(sweeps, description="detecting"):
                 if results.is_finished(sweep.name):
