@@ -2,7 +2,9 @@
 
 import os
 import pathlib
+import tokenize
 import zipfile
+import zlib
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -15,7 +17,11 @@ ARRAY_NAMES = ("points", "xyz", "pointcloud", "data", "arr_0")
 
 _COLUMNS = ("x", "y", "z", "intensity")
 _MAX_VALUES = 64 * MAX_POINTS
-_READ_ERRORS = (ValueError, OSError, EOFError, KeyError, zipfile.BadZipFile)
+_READ_ERRORS = (
+    ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, SyntaxError,
+    tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What NumPy and its parsers raise on broken bytes."""
 
 
 def read_npy(path: str | os.PathLike[str]) -> Points:

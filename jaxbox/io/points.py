@@ -59,8 +59,8 @@ def named_points(columns: Mapping[str, np.ndarray], where: str) -> Points:
     if wrong := [name for name in "xyz" if known[name].dtype.kind not in "fiu" or known[name].ndim != 1]:
         raise InputError(f"{where}: field {wrong[0]} is not one real number a point.")
     intensity = next((known[name] for name in INTENSITY_NAMES if name in known), None)
-    # A number beyond float32's range becomes infinite, and is counted by the detector.
-    with np.errstate(over="ignore"):
+    # A number beyond float32's range becomes infinite, and is counted by the detector, as NaN of any kind.
+    with np.errstate(over="ignore", invalid="ignore"):
         xyz = np.stack([known[name].astype(np.float32) for name in "xyz"], axis=1)
         if intensity is None or intensity.dtype.kind not in "fiu" or intensity.ndim != 1:
             return xyz, np.zeros(len(xyz), np.float32)
