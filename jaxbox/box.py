@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox.masked import fold_points, map_rows, sort_by_group, store, take
+from jaxbox.grouping import sort_by_group
+from jaxbox.masked import fold_points, map_rows, store, take
 from jaxbox.types import Rectangles
 
 CHUNK = 128

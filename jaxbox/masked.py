@@ -1,4 +1,4 @@
-"""The fixed-shape toolbox: compaction, masked statistics, sets of cells, work in chunks.
+"""The fixed-shape toolbox: compaction, masked statistics, work in chunks.
 
 Every function keeps static shapes. A row that is absent is marked by the sentinel index N, one past
 the last; `take` reads zeros there and scatters with ``mode="drop"`` ignore it.
@@ -16,9 +16,6 @@ BLOCK = 512
 
 WORD_BITS = 32
 """Bits of a word of a set of flags."""
-
-SORT_STEPS = 4
-"""Sorts are as long as what is there, in so many steps."""
 
 FOLD_UNROLL = 4
 """Points folded in one step of the loop over them."""
@@ -359,110 +356,6 @@ def largest_first(size: jax.Array, max_size: int) -> tuple[jax.Array, jax.Array]
     """
     order, _ = group_by(max_size - size, max_size + 1)
     return order, jnp.zeros_like(order).at[order].set(jnp.arange(order.shape[0], dtype=order.dtype))
-
-
-def group_by(group: jax.Array, num_groups: int) -> tuple[jax.Array, jax.Array]:
-    """Orders rows by group, keeping their order within one.
-
-    Args:
-      group: (N,) int32, in [0, num_groups], the latter for rows of no group, which come last.
-      num_groups: static, K.
-
-    Returns:
-      order: (N,) int32 row indices.
-      start: (K + 1,) int32: group k is order[start[k]:start[k + 1]].
-
-    >>> order, start = group_by(jnp.array([1, 0, 2, 1]), 2)
-    >>> order.tolist(), start.tolist()
-    ([1, 0, 3, 2], [0, 1, 3])
-    """
-    size = group.shape[0]
-    index_bits, group_bits = size.bit_length(), num_groups.bit_length()
-    index = jnp.arange(size, dtype=jnp.uint32)
-    if index_bits + group_bits <= WORD_BITS:
-        # One packed word sorts several times faster than a key with its value.
-        packed = _sort_present((group.astype(jnp.uint32) << index_bits) | index, group < num_groups)
-        order = packed & (2**index_bits - 1)
-    else:
-        order = jax.lax.sort((group, index), num_keys=1, is_stable=True)[1]
-    count = jnp.zeros(num_groups, jnp.int32).at[group].add(1, mode="drop")
-    end = prefix_sum(count)
-    return order.astype(jnp.int32), jnp.concatenate([jnp.zeros(1, jnp.int32), end])
-
-
-def sort_by_group(
-    read: Callable[[jax.Array], Any], group: jax.Array, num_rows: jax.Array, num_groups: int, *, room: int = 0
-) -> tuple[Any, jax.Array, jax.Array]:
-    """Sorts rows by group, keeping their order within one.
-
-    Args:
-      read: gives the values of rows, a pytree of arrays, by their indices.
-      group: (N,) int32, in [0, num_groups).
-      num_rows: () int32; only the first so many rows count.
-      num_groups: static, K.
-      room: static, rows added at the end.
-
-    Returns:
-      values: pytree of (N + room,) arrays, sorted; anything finite beyond `num_rows`.
-      begin: (K,) int32: group k is rows begin[k] to end[k].
-      end: (K,) int32.
-
-    >>> letters = jnp.array([5, 6, 7])
-    >>> values, begin, end = sort_by_group(lambda i: letters[i], jnp.array([1, 0, 1]), jnp.int32(3), 2)
-    >>> values.tolist(), begin.tolist(), end.tolist()
-    ([6, 5, 7], [0, 1], [1, 3])
-    """
-    size = group.shape[0]
-    num_rows = jnp.minimum(num_rows, size)
-    group = store(jnp.where(jnp.arange(size) < num_rows, group, num_groups), num_rows >= 0)
-    count = jnp.zeros(num_groups, jnp.int32).at[group].add(1, mode="drop")
-    end = prefix_sum(count)
-
-    def place(branch: Callable[..., Any]) -> Callable[..., Any]:
-        return functools.partial(branch, read, room=room)
-
-    values = jax.lax.platform_dependent(
-        group, num_rows, end - count, cpu=place(_place_one_by_one), default=place(_place_sorted)
-    )
-    return values, end - count, end
-
-
-def _place_one_by_one(
-    read: Callable[[jax.Array], Any], group: jax.Array, num_rows: jax.Array, begin: jax.Array, *, room: int
-) -> Any:
-    """Counting sort: XLA compiles so small a loop to native code on the CPU."""
-
-    def step(i: jax.Array, state: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
-        # The count goes up before it is read: the other way round the whole array would be copied.
-        after, placed = state
-        after = after.at[group[i]].add(1, mode="promise_in_bounds")
-        place = after.at[group[i]].get(mode="promise_in_bounds") - 1
-        return after, jax.tree.map(lambda p, v: p.at[place].set(v, mode="promise_in_bounds"), placed, read(i))
-
-    shapes = jax.eval_shape(read, jax.ShapeDtypeStruct((), jnp.int32))
-    empty = jax.tree.map(lambda s: jnp.zeros(group.shape[0] + room, s.dtype), shapes)
-    return jax.lax.fori_loop(0, num_rows, step, (begin, empty))[1]
-
-
-def _place_sorted(
-    read: Callable[[jax.Array], Any], group: jax.Array, num_rows: jax.Array, begin: jax.Array, *, room: int
-) -> Any:
-    order, _ = group_by(group, begin.shape[0])
-    return jax.tree.map(lambda v: jnp.pad(v, (0, room)), read(order))
-
-
-def _sort_present(words: jax.Array, present: jax.Array) -> jax.Array:
-    """Sorts words of which the absent ones are largest and in order: those past the last present one stay."""
-    size = words.shape[0]
-    step = -(-size // SORT_STEPS)
-    num = jnp.max(jnp.where(present, jnp.arange(1, size + 1), 0), initial=0)
-
-    def sort_first(count: int, words: jax.Array) -> jax.Array:
-        return jnp.concatenate([jax.lax.sort(words[:count], is_stable=False), words[count:]])
-
-    counts = [min(step * (i + 1), size) for i in range(SORT_STEPS)]
-    branches = [functools.partial(sort_first, count) for count in counts]
-    return jax.lax.switch(jnp.maximum(num - 1, 0) // max(step, 1), branches, words)
 
 
 def fold_points(

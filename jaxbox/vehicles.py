@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.geometry import rectangle_iou
-from jaxbox.masked import WORD_BITS, map_rows, prefix_sum, sort_by_group
+from jaxbox.grouping import sort_by_group
+from jaxbox.masked import WORD_BITS, map_rows, prefix_sum
 
 NEARBY_CELL_M = 1.0
 """Points are looked up by cells of this size."""

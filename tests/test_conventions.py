@@ -25,6 +25,7 @@ FOUNDATION = {
     "padding",
     "settings",
     "masked",
+    "grouping",
     "geometry",
 }
 STAGES = {

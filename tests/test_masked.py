@@ -5,14 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbox import masked
+from jaxbox import grouping, masked
 
 SIZES = (1, 2, masked.BLOCK - 1, masked.BLOCK, masked.BLOCK + 1, 3 * masked.BLOCK + 7)
 
 # Compiled whole: run step by step, each step of each size would compile alone.
 prefix_sum = jax.jit(masked.prefix_sum)
 compact = jax.jit(masked.compact, static_argnums=1)
-group_by = jax.jit(masked.group_by, static_argnums=1)
+group_by = jax.jit(grouping.group_by, static_argnums=1)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -151,7 +151,7 @@ def test_both_sorts_of_group_by_are_tried_above():
 def test_sort_by_group_is_a_stable_sort_of_the_first_rows_on_every_platform(platform, num_rows, monkeypatch):
     group = np.random.default_rng(num_rows).integers(0, 40, 1000)
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[platform](*args))
-    (rows, minus), begin, end = masked.sort_by_group(
+    (rows, minus), begin, end = grouping.sort_by_group(
         lambda i: (i, -i), jnp.asarray(group), jnp.int32(num_rows), 40, room=3
     )
     assert rows.shape == minus.shape == (1003,)
@@ -203,7 +203,7 @@ def test_the_toolbox_gives_the_same_under_jit_and_vmap():
 
     def both(mask):
         index, count = masked.compact(mask, 64)
-        order, start = masked.group_by(jnp.where(mask, 1, 2), 2)
+        order, start = grouping.group_by(jnp.where(mask, 1, 2), 2)
         return index, count, order, start
 
     singles = [both(mask) for mask in masks]
