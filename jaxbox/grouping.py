@@ -13,6 +13,25 @@ SORT_STEPS = 4
 """Sorts are as long as what is there, in so many steps."""
 
 
+def largest_first(size: jax.Array, max_size: int) -> tuple[jax.Array, jax.Array]:
+    """Orders rows by descending size, keeping their order within one.
+
+    Args:
+      size: (P,) int32, in [0, max_size].
+      max_size: static.
+
+    Returns:
+      order: (P,) int32 row indices.
+      place: (P,) int32: row i is order[place[i]].
+
+    >>> order, place = largest_first(jnp.array([1, 3, 1]), 4)
+    >>> order.tolist(), place.tolist()
+    ([1, 0, 2], [1, 0, 2])
+    """
+    order, _ = group_by(max_size - size, max_size + 1)
+    return order, jnp.zeros_like(order).at[order].set(jnp.arange(order.shape[0], dtype=order.dtype))
+
+
 def group_by(group: jax.Array, num_groups: int) -> tuple[jax.Array, jax.Array]:
     """Orders rows by group, keeping their order within one.
 

@@ -310,54 +310,6 @@ def fold_rows(
     return jax.lax.fori_loop(0, (jnp.minimum(num_rows, size) + chunk - 1) // chunk, step, state)
 
 
-def map_by_size(
-    function: Callable[[Any], Any],
-    rows: Any,
-    size: jax.Array,
-    *,
-    max_size: int,
-    num_rows: jax.Array,
-    chunk: int,
-) -> Any:
-    """As `map_rows`, with rows of like size in one chunk.
-
-    For functions with a loop that ends with the largest row of its chunk: few chunks hold the large ones.
-
-    Args:
-      function: maps a pytree of (chunk, ...) arrays to another one, each row by itself.
-      rows: pytree of (P, ...) arrays.
-      size: (P,) int32, in [0, max_size].
-      max_size: static.
-      num_rows: () int32, how many rows count.
-      chunk: static, rows at a time.
-
-    Returns:
-      Pytree of (P, ...) arrays, in the order of `rows`; those beyond `num_rows` may be anything finite.
-    """
-    order, place = largest_first(jnp.where(jnp.arange(size.shape[0]) < num_rows, size, 0), max_size)
-    mapped = map_rows(function, jax.tree.map(lambda a: a[order], rows), num_rows=num_rows, chunk=chunk)
-    return jax.tree.map(lambda a: a[place], mapped)
-
-
-def largest_first(size: jax.Array, max_size: int) -> tuple[jax.Array, jax.Array]:
-    """Orders rows by descending size, keeping their order within one.
-
-    Args:
-      size: (P,) int32, in [0, max_size].
-      max_size: static.
-
-    Returns:
-      order: (P,) int32 row indices.
-      place: (P,) int32: row i is order[place[i]].
-
-    >>> order, place = largest_first(jnp.array([1, 3, 1]), 4)
-    >>> order.tolist(), place.tolist()
-    ([1, 0, 2], [1, 0, 2])
-    """
-    order, _ = group_by(max_size - size, max_size + 1)
-    return order, jnp.zeros_like(order).at[order].set(jnp.arange(order.shape[0], dtype=order.dtype))
-
-
 def fold_points(
     x: jax.Array,
     y: jax.Array,

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 
 from jaxbox import box, completion, evidence, hull
 from jaxbox.config import CompletionConfig, DetectorConfig
-from jaxbox.masked import compact, largest_first, lookup, map_rows, take
+from jaxbox.grouping import largest_first
+from jaxbox.masked import compact, lookup, map_rows, take
 from jaxbox.steps.common import class_values, stage_options
 from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals, Trials, list_trials, longest_side
