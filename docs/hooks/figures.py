@@ -111,11 +111,32 @@ def ground() -> str:
 
 
 def speed() -> str:
-    """Whole sweeps and steps."""
-    report = load("detect")
-    rows = [(name, *list(report["whole"][name].values())[:4]) for name in ("detect", "reference")]
-    rows += [(name, *list(values.values())[:4]) for name, values in report.get("steps", {}).items()]
+    """Whole sweeps and steps of the default preset, and the whole of the paper's."""
+    report, paper = load("stages"), load("stages_paper")
+    names = ("min", "median", "p90", "p99")
+    rows = [(f"default, {name}", *(report["whole"][name][n] for n in names)) for name in WHOLES]
+    rows += [(f"paper, {name}", *(paper["whole"][name][n] for n in names)) for name in WHOLES]
+    rows += [(f"`{name}`", *(values[n] for n in names)) for name, values in report["steps"].items()]
     return table(["", "min ms", "median ms", "p90 ms", "p99 ms"], rows) + made_with(report)
+
+
+WHOLES = ("host to host", "on the device")
+
+
+def frontier() -> str:
+    """Accuracy against time of the presets."""
+    report = load("frontier")
+    names = list(report["presets"]["default"])
+    rows = [(preset, *(row[n] for n in names)) for preset, row in report["presets"].items()]
+    return table(["", *names], rows) + made_with(report)
+
+
+def peers() -> str:
+    """Other libraries on the same sweeps."""
+    report = load("peers")
+    names = ("median", "p99", "clusters", "boxes", "recall")
+    rows = [(chain, *(row[n] for n in names)) for chain, row in report["chains"].items()]
+    return table(["", "median ms", "p99 ms", "clusters", "boxes", "recall"], rows) + made_with(report)
 
 
 def status() -> str:
@@ -141,6 +162,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "cuts": cuts,
     "ground": ground,
     "speed": speed,
+    "frontier": frontier,
+    "peers": peers,
     "status": status,
     "counts": counts,
 }
