@@ -150,6 +150,8 @@ def test_interrupted_the_files_are_whole_and_the_rest_can_be_resumed(
 ):
     paths = sorted(sweeps.iterdir())
     read = io.Sweep.read_points
+    # A process that was started in the background ignores Ctrl-C.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def interrupted(self):
         if self.name == "b":
@@ -159,6 +161,7 @@ def test_interrupted_the_files_are_whole_and_the_rest_can_be_resumed(
     with monkeypatch.context() as patch:
         patch.setattr(io.Sweep, "read_points", interrupted)
         result = detect(tmp_path, *paths, *ONE_FILE)
+    signal.signal(signal.SIGINT, before)
     assert result.exit_code == 1
     assert "--resume goes on" in result.stderr
     assert [record["name"] for record in records_of(tmp_path)] == ["a"]
