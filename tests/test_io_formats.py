@@ -85,6 +85,40 @@ def test_what_the_library_writes_is_read_back_with_its_non_finite_points(tmp_pat
     assert sweep.timestamp_ns == (1532402927647951000 if "LIDAR_TOP" in name else None)
 
 
+def write_las(path):
+    las = laspy.LasData(laspy.LasHeader(point_format=1, version="1.2"))
+    las.x, las.y, las.z = FINITE.T.astype(float)
+    las.write(path)
+
+
+@pytest.mark.parametrize("name", ["a.las", "a.laz"])
+def test_tables_that_claim_more_than_the_file_are_refused_before_they_are_read(tmp_path, name):
+    file = tmp_path / name
+    write_las(file)
+    data = bytearray(file.read_bytes())
+    # Of records in LAS; of chunks in LAZ, for which the decoder would ask 64 GB and end the process.
+    place = (
+        100
+        if name == "a.las"
+        else struct.unpack_from("<q", data, struct.unpack_from("<I", data, 96)[0])[0] + 4
+    )
+    struct.pack_into("<I", data, place, 2**32 - 1)
+    file.write_bytes(data)
+    with pytest.raises(io.InputError, match=rf"{name}: {len(data)} bytes .* promises"):
+        io.open_sweeps(file)[0].read_points()
+
+
+def test_a_compressed_pcd_whose_bytes_are_broken_is_an_input_error(tmp_path):
+    file = tmp_path / "a.pcd"
+    write_pcd(file, "binary_compressed")
+    data = bytearray(file.read_bytes())
+    # A back reference to before the beginning, where LZF expects a literal.
+    data[data.index(b"DATA binary_compressed") + len("DATA binary_compressed\n") + 8] = 0xFF
+    file.write_bytes(data)
+    with pytest.raises(io.InputError, match="the points cannot be read"):
+        io.open_sweeps(file)[0].read_points()
+
+
 @pytest.mark.parametrize("name", ["a.las", "a.laz"])
 def test_las_and_laz_are_scaled_and_map_coordinates_are_refused(tmp_path, name):
     for offset, file in ((0.0, tmp_path / name), (4.5e5, tmp_path / f"map_{name}")):

@@ -1,6 +1,8 @@
 """LAS and LAZ, the survey formats, by way of laspy: for sweeps that were saved in their sensor's frame."""
 
 import os
+import pathlib
+import struct
 
 import numpy as np
 
@@ -10,6 +12,13 @@ from jaxbox.io.points import PointFormat, Points, check_num_bytes, check_num_poi
 
 MAP_DISTANCE_M = 10_000.0
 """Points whose median is farther from the origin than this are on a map, not round a sensor."""
+
+_NUM_HEADER_BYTES = 375
+"""Of the longest header, that of LAS 1.4."""
+_VLR_BYTES, _EVLR_BYTES = 54, 60
+"""Least size of a variable length record, and of an extended one."""
+_COMPRESSED = 0x80
+"""Bit of the point format that LAZ sets."""
 
 
 def read_las(path: str | os.PathLike[str]) -> Points:
@@ -28,6 +37,7 @@ def read_las(path: str | os.PathLike[str]) -> Points:
     laspy = require("laspy", extra="las", what="LAS and LAZ files")
     try:
         size = os.stat(path).st_size
+        _check_tables(pathlib.Path(path), size)
         with laspy.open(path) as reader:
             header = reader.header
             check_num_points(header.point_count, str(path))
@@ -45,6 +55,33 @@ def read_las(path: str | os.PathLike[str]) -> Points:
     columns = {name: np.asarray(getattr(points, name)) for name in ("x", "y", "z", "intensity")}
     _check_frame(columns, str(path))
     return named_points(columns, str(path))
+
+
+def _check_tables(path: pathlib.Path, size: int) -> None:
+    """Holds the lengths of the file's tables against its size: the decoders would loop or ask for memory."""
+    with path.open("rb") as file:
+        header = file.read(_NUM_HEADER_BYTES).ljust(_NUM_HEADER_BYTES, b"\0")
+        start, num_vlrs, point_format = struct.unpack_from("<IIB", header, 96)
+        check_num_bytes(num_vlrs * _VLR_BYTES, size, str(path))
+        if header[24:26] >= b"\1\4":
+            (num_evlrs,) = struct.unpack_from("<I", header, 243)
+            check_num_bytes(num_evlrs * _EVLR_BYTES, size, str(path))
+        if point_format < _COMPRESSED:
+            return
+        file.seek(start)
+        table = _read_int64(file.read(8))
+        if table < 0:
+            # Written as a stream: the last bytes say where the table is.
+            file.seek(max(size - 8, 0))
+            table = _read_int64(file.read(8))
+        file.seek(min(max(table, 0), size))
+        _, num_chunks = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
+        # No chunk is smaller than a byte.
+        check_num_bytes(num_chunks, size, str(path))
+
+
+def _read_int64(data: bytes) -> int:
+    return struct.unpack("<q", data.ljust(8, b"\0"))[0]
 
 
 def _check_frame(columns: dict[str, np.ndarray], where: str) -> None:

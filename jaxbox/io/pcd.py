@@ -48,7 +48,8 @@ def read_pcd(path: str | os.PathLike[str]) -> Points:
             whole = io.BytesIO("\n".join([*lines, ""]).encode() + file.read())
             try:
                 cloud = pypcd4.PointCloud.from_fileobj(whole).pc_data
-            except (ValueError, RuntimeError, struct.error) as error:
+            # The decompressor answers None for broken bytes, which pypcd4 takes the length of.
+            except (ValueError, TypeError, RuntimeError, struct.error) as error:
                 raise InputError(f"{path}: the points cannot be read ({error}); copy it again.") from error
     except FileNotFoundError as error:
         raise InputError(f"{path}: there is no such file; check the path.") from error
