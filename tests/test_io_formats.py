@@ -112,8 +112,9 @@ def test_a_compressed_pcd_whose_bytes_are_broken_is_an_input_error(tmp_path):
     file = tmp_path / "a.pcd"
     write_pcd(file, "binary_compressed")
     data = bytearray(file.read_bytes())
-    # A back reference to before the beginning, where LZF expects a literal.
-    data[data.index(b"DATA binary_compressed") + len("DATA binary_compressed\n") + 8] = 0xFF
+    # A copy that is longer than the room that is left: the decompressor has no answer.
+    body = data.index(b"DATA binary_compressed") + len("DATA binary_compressed\n")
+    data[body + 17] = 0xFF
     file.write_bytes(data)
     with pytest.raises(io.InputError, match="the points cannot be read"):
         io.open_sweeps(file)[0].read_points()
