@@ -50,7 +50,7 @@ ABLATIONS = (
     # Points.
     Ablation("no filter", {"filtering.enabled": False}),
     Ablation("one plane instead of the ground grid", {"ground.surface": False, **MORE_POINTS}),
-    Ablation("ground grid of twice the grade", {"ground.max_grade": 0.2}),
+    Ablation("ground grid of grade 0.2", {"ground.max_grade": 0.2}),
     # Proposals.
     Ablation("one map: 0.2 m", _without_maps(1, 2)),
     Ablation("one map: 0.35 m", {"clustering.maps.0.cell_m": 0.35, **_without_maps(1, 2)}),

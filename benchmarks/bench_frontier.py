@@ -15,9 +15,10 @@ import jax
 import numpy as np
 
 import jaxbox
-from benchmarks import bench_accuracy, common
+from benchmarks import common
+from benchmarks.bench_ablation import copy_figures
 from jaxbox import DetectorConfig, PointCloud
-from jaxbox.evaluation.copies import COPIES, label_points, read_frame
+from jaxbox.evaluation.copies import COPIES, Frame, label_points, read_frame
 from jaxbox.io import Sweep, open_sweeps
 from jaxbox.viz.plots import save_figure
 
@@ -41,15 +42,11 @@ def time_presets(sweeps: Sequence[Sweep], presets: Mapping[str, DetectorConfig])
     return spent
 
 
-def measure_accuracy(sweeps: Sequence[Sweep], config: DetectorConfig, num_copies: int) -> dict[str, float]:
+def measure_accuracy(
+    frames: Sequence[Frame], num_points: Mapping[str, np.ndarray], config: DetectorConfig, num_copies: int
+) -> dict[str, float]:
     """Mean figures over the copies."""
-    frames = [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
-    labels = {frame.name: frame.labels for frame in frames}
-    num_points = {frame.name: label_points(frame) for frame in frames}
-    rows = []
-    for copy in COPIES[:num_copies]:
-        results, _ = bench_accuracy.detect_frames(frames, copy, config)
-        rows.append(bench_accuracy.figures(bench_accuracy.measure(labels, results, num_points)))
+    rows = [copy_figures(frames, num_points, copy, config)[0] for copy in COPIES[:num_copies]]
     means = {name: float(np.mean([row[name] for row in rows])) for name in COLUMNS[2:5]}
     return means | {"SOFT sd": float(np.std([row["SOFT"] for row in rows]))}
 
@@ -76,12 +73,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     presets = {name: common.chosen_config(options, preset=name) for name in DetectorConfig.presets()}
     sweeps = open_sweeps(common.data_folder("kitti_object"))
+    frames = [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
+    num_points = {frame.name: label_points(frame) for frame in frames}
     spent = time_presets(sweeps, presets)
     table: dict[str, dict[str, Any]] = {}
     for name, config in presets.items():
         median, p90 = np.percentile(spent[name], [50, 90])
         times = {"median ms": float(median), "p90 ms": float(p90)}
-        table[name] = times | measure_accuracy(sweeps, config, options.copies)
+        table[name] = times | measure_accuracy(frames, num_points, config, options.copies)
     common.print_table(
         ["preset", *COLUMNS], [[name, *(row[c] for c in COLUMNS)] for name, row in table.items()]
     )
