@@ -44,6 +44,7 @@ ALLOWED = {
     **dict.fromkeys(TOOLS, FOUNDATION | STAGES | WIRING | TOOLS),
     "export": FOUNDATION | WIRING | {"io"},
     "tuning": FOUNDATION | WIRING | TOOLS,
+    "viewer": FOUNDATION | WIRING | TOOLS,
 }
 TOP = {"cli", "__main__", "__init__"}
 
@@ -58,6 +59,7 @@ PUBLIC_MODULES = [
     "jaxbox.tuning",
     "jaxbox.viz",
     "jaxbox.synthetic",
+    "jaxbox.viewer",
 ]
 
 

@@ -1,4 +1,4 @@
-"""The six commands and their options; the work is done in the module of each."""
+"""The seven commands and their options; the work is done in the module of each."""
 
 import pathlib
 from typing import Annotated
@@ -16,6 +16,7 @@ from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.cli.settings import chosen_config
 from jaxbox.cli.sweep_info import print_sweep_info
 from jaxbox.cli.tune import TuneOptions, run_tune
+from jaxbox.cli.view import ViewOptions, run_view
 from jaxbox.evaluation.copies import COPIES
 from jaxbox.evaluation.objectives import OBJECTIVES
 from jaxbox.io import InputError
@@ -57,6 +58,16 @@ jaxbox detect 'clouds/*.pcd' --output out --format parquet --format jsonl --no-p
 jaxbox detect drive.mcap --output out --format parquet --resume
 
 jaxbox detect sweep.pcd --output out --config my.toml --set vehicles.min_score=0.1 --json
+
+"""
+
+VIEW_EXAMPLES = """Examples:
+
+jaxbox view KITTI/training
+
+jaxbox view drive.bag --topic /velodyne_points --preset fast
+
+jaxbox view 'clouds/*.pcd' --config my.toml --port 0 --open
 
 """
 
@@ -302,3 +313,43 @@ def info(
             print_sweep_info(paths, topic=topic, num_sweeps=num_sweeps, as_json=json, console=stdout())
         else:
             print_info(stdout(), as_json=json)
+
+
+@app.command(epilog=VIEW_EXAMPLES + EXIT_CODES)
+def view(
+    paths: Annotated[list[str], typer.Argument(help="What `detect` takes.")],
+    *,
+    host: Annotated[
+        str, typer.Option(help="Address to listen at. The default is reached from this machine only.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")] = 8080,
+    open_browser: Annotated[bool, typer.Option("--open", help="Open the browser at the page.")] = False,
+    preset: PresetOption = None,
+    settings: SettingsOption = None,
+    changes: SetOption = None,
+    topic: Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")] = None,
+    capacity: Annotated[
+        int | None,
+        typer.Option(min=1, help="Points a sweep is padded to; by default what it needs. One compile each."),
+    ] = None,
+    min_score: Annotated[
+        float,
+        typer.Option(min=0.0, max=1.0, help="Boxes that score less are hidden at first."),
+    ] = SHOWN_MIN_SCORE,
+) -> None:
+    """Show sweeps and boxes in the browser, and move thresholds live (the view extra).
+
+    A page with the points, boxes, hulls and labels in 3D, the camera's image, a timeline, and sliders that
+    detect anew without compiling. "copy settings" gives the TOML for `detect --config`.
+    """
+    with input_errors():
+        options = ViewOptions(
+            config=chosen_config(preset, settings, changes or []),
+            host=host,
+            port=port,
+            topic=topic,
+            capacity=capacity,
+            min_score=min_score,
+            open_browser=open_browser,
+        )
+        raise typer.Exit(run_view(paths, options, stdout()))

@@ -1,0 +1,31 @@
+"""An interactive page of sweeps and boxes in the browser (the ``view`` extra).
+
+`Frames` reads sweeps, `Session` detects in them, `build_scene` makes arrays of what is to be drawn, and
+`Viewer` keeps a page in step with what its user asks for; `open_viewer` puts them together behind an
+address. Only `page` and `server` know viser.
+"""
+
+from jaxbox.viewer.frames import Frame, Frames
+from jaxbox.viewer.scene import COLORINGS, Scene, View, build_scene
+from jaxbox.viewer.serving import open_viewer
+from jaxbox.viewer.session import Session, Shown
+from jaxbox.viewer.settings_text import settings_text
+from jaxbox.viewer.thresholds import THRESHOLDS, Threshold
+from jaxbox.viewer.viewer import Viewer, Wanted
+
+__all__ = [
+    "COLORINGS",
+    "THRESHOLDS",
+    "Frame",
+    "Frames",
+    "Scene",
+    "Session",
+    "Shown",
+    "Threshold",
+    "View",
+    "Viewer",
+    "Wanted",
+    "build_scene",
+    "open_viewer",
+    "settings_text",
+]

@@ -1,0 +1,250 @@
+"""What the page draws of a sweep and its detections, as arrays: no viewer is needed to make it."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from jaxbox.config import DEFAULT_CUT
+from jaxbox.types import Detections
+from jaxbox.viewer.frames import Frame
+from jaxbox.viz import BoxGroup, BoxSet, color_by_height, color_by_id, draw_image_boxes
+from jaxbox.viz.colors import ESTIMATE, HULL, IGNORED, TRUTH, Color, shade_by_height
+
+GROUND_COLOR: Color = (120, 100, 80)
+"""Points of the ground."""
+OBSTACLE_COLOR: Color = (120, 215, 255)
+"""Points above it."""
+CAPTION_GAP_M = 0.3
+"""Captions stand so high above their boxes, and those of labels hang so far below: none hides the other."""
+_INTENSITY_TOP = 99.0
+"""Percentile of the intensities that has the highest colour: a few mirrors outshine everything."""
+_LOW_PERCENTILE = 5.0
+_LABEL_MARGIN_M = 0.1
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class View:
+    """What is to be seen of a sweep."""
+
+    coloring: str = "height"
+    """What the colours of the points mean: one of `COLORINGS`."""
+    min_score: float = DEFAULT_CUT
+    """Boxes that score less are hidden."""
+    boxes: bool = True
+    """Whether boxes are drawn."""
+    hulls: bool = True
+    """Whether the hulls of their points are."""
+    captions: bool = True
+    """Whether class and score stand above them."""
+    labels: bool = True
+    """Whether labelled boxes are drawn."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Caption:
+    """A short text in space."""
+
+    text: str
+    """The text."""
+    position: tuple[float, float, float]
+    """m, sensor frame."""
+    below: bool = False
+    """Whether it hangs from the position, and does not stand on it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Lines:
+    """Lines of one colour."""
+
+    segments: np.ndarray
+    """(n, 2, 3) float32, m, sensor frame."""
+    color: Color
+    """Red, green, blue."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Scene:
+    """Arrays of what is drawn, sensor frame."""
+
+    points: np.ndarray
+    """(n, 3) float32, m: the frame's own array, so that an unchanged sweep is known by it."""
+    colors: np.ndarray
+    """(n, 3) uint8: of the points."""
+    lines: Mapping[str, Lines]
+    """By name: ``boxes``, ``hulls``, ``labels`` and ``other_labels``; some may be empty."""
+    captions: tuple[Caption, ...]
+    """Class and score of each box, and the type of each label."""
+    image: np.ndarray | None
+    """(h, w, 3) uint8: the camera's image with the boxes, where there is one."""
+    num_boxes: int
+    """Boxes drawn, or that would be were they not switched off."""
+
+
+def build_scene(frame: Frame, detections: Detections | None, view: View) -> Scene:
+    """Puts the arrays together.
+
+    Args:
+      frame: the sweep.
+      detections: the answer for it; None where there is none yet.
+      view: what is to be seen.
+
+    Returns:
+      The scene.
+    """
+    min_score = view.min_score
+    found = _no_boxes() if detections is None else BoxSet.from_detections(detections, min_score=min_score)
+    boxes = found if view.boxes else _no_boxes()
+    hulls = [] if detections is None or not view.hulls else _hull_lines(detections, found, min_score)
+    vehicles, others = (
+        labels if view.labels and labels is not None else _no_boxes()
+        for labels in (frame.vehicles, frame.others)
+    )
+    lines = {
+        "boxes": Lines(segments=_edges(boxes), color=ESTIMATE),
+        "hulls": Lines(segments=_stacked(hulls), color=HULL),
+        "labels": Lines(segments=_edges(vehicles), color=TRUTH),
+        "other_labels": Lines(segments=_edges(others), color=IGNORED),
+    }
+    captions = [*_captions(boxes), *_captions(vehicles, below=True), *_captions(others, below=True)]
+    return Scene(
+        points=frame.xyz,
+        colors=COLORINGS[view.coloring](frame, detections),
+        lines=lines,
+        captions=tuple(captions if view.captions else ()),
+        image=_camera_picture(frame, boxes, vehicles, others),
+        num_boxes=len(found),
+    )
+
+
+def _no_boxes() -> BoxSet:
+    return BoxSet(center=np.zeros((0, 3)), size=np.zeros((0, 3)), yaw=np.zeros(0))
+
+
+def _edges(boxes: BoxSet) -> np.ndarray:
+    return boxes.segments().reshape(-1, 2, 3).astype(np.float32)
+
+
+def _stacked(segments: list[np.ndarray]) -> np.ndarray:
+    return np.concatenate([np.zeros((0, 2, 3)), *segments]).astype(np.float32)
+
+
+def _hull_lines(detections: Detections, boxes: BoxSet, min_score: float) -> list[np.ndarray]:
+    """The hull of each box's points, drawn round its foot and its top."""
+    # The same comparison as that which chose the boxes, so that the rows are theirs.
+    keep = np.asarray(detections.valid) & (np.asarray(detections.score, np.float64) >= min_score)
+    polygons, capacity = np.asarray(detections.hulls.vertices)[keep], detections.hulls.vertices.shape[1]
+    counts = np.minimum(np.asarray(detections.hulls.num_vertices)[keep], capacity)
+    half_heights = np.array([[-0.5, 0.5]]) * boxes.size[:, 2:]
+    levels = boxes.center[:, 2:] + half_heights
+    return [
+        _ring(polygon[:count], z)
+        for polygon, count, pair in zip(polygons, counts, levels.tolist(), strict=True)
+        for z in pair
+    ]
+
+
+def _ring(polygon: np.ndarray, z: float) -> np.ndarray:
+    """(h, 2, 3): the sides of a polygon at a height."""
+    corners = np.column_stack([polygon, np.full(len(polygon), z)])
+    return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+
+
+def _captions(boxes: BoxSet, *, below: bool = False) -> list[Caption]:
+    shift = boxes.size[:, 2] / 2 + CAPTION_GAP_M
+    x, y, z = boxes.center.T
+    places = np.stack([x, y, z - shift if below else z + shift], axis=1).tolist()
+    return [
+        Caption(text=text, position=(x, y, z), below=below)
+        for text, (x, y, z) in zip(boxes.captions, places, strict=True)
+    ]
+
+
+def _camera_picture(frame: Frame, boxes: BoxSet, vehicles: BoxSet, others: BoxSet) -> np.ndarray | None:
+    if frame.image is None or frame.calibration is None:
+        return frame.image
+    groups = [
+        BoxGroup(name="box", boxes=boxes, color=ESTIMATE),
+        BoxGroup(name="label", boxes=dataclasses.replace(vehicles, captions=()), color=TRUTH, thickness_px=1),
+        BoxGroup(name="other", boxes=dataclasses.replace(others, captions=()), color=IGNORED, thickness_px=1),
+    ]
+    return draw_image_boxes(frame.image, frame.calibration, groups=groups, legend=False)
+
+
+def _by_height(frame: Frame, detections: Detections | None) -> np.ndarray:
+    return color_by_height(_height_above_ground(frame, detections))
+
+
+def _by_cluster(frame: Frame, detections: Detections | None) -> np.ndarray:
+    return color_by_id(_rows_of(frame, None if detections is None else detections.point_component))
+
+
+def _by_vehicle(frame: Frame, detections: Detections | None) -> np.ndarray:
+    ids = _rows_of(frame, None if detections is None else detections.point_detection)
+    shades = shade_by_height(_height_above_ground(frame, detections))
+    return np.where(ids[:, None] < 0, shades, color_by_id(ids))
+
+
+def _by_ground(frame: Frame, detections: Detections | None) -> np.ndarray:
+    is_ground = (
+        np.zeros(len(frame.rows), bool)
+        if detections is None
+        else np.asarray(detections.ground_mask)[frame.rows]
+    )
+    return np.where(is_ground[:, None], GROUND_COLOR, OBSTACLE_COLOR).astype(np.uint8)
+
+
+def _by_label(frame: Frame, detections: Detections | None) -> np.ndarray:
+    colors = shade_by_height(_height_above_ground(frame, detections))
+    for labels, color in ((frame.others, IGNORED), (frame.vehicles, TRUTH)):
+        if labels is not None:
+            colors[_inside_any(frame.xyz, labels)] = color
+    return colors
+
+
+def _by_intensity(frame: Frame, _: Detections | None) -> np.ndarray:
+    shown = np.where(np.isfinite(frame.intensity), frame.intensity, 0)
+    high = np.percentile(shown, _INTENSITY_TOP) if len(shown) else 0
+    return color_by_height(shown, low_m=0, high_m=float(high) or 1.0)
+
+
+Coloring = Callable[[Frame, Detections | None], np.ndarray]
+"""(n, 3) uint8 of a frame's points, with or without an answer."""
+
+COLORINGS: Mapping[str, Coloring] = {
+    "height": _by_height,
+    "cluster": _by_cluster,
+    "ground": _by_ground,
+    "vehicle": _by_vehicle,
+    "label": _by_label,
+    "intensity": _by_intensity,
+}
+"""What the colours of the points may mean: height above the ground plane, component of the first map,
+ground or not, box, labelled box, intensity."""
+
+
+def _rows_of(frame: Frame, values: object) -> np.ndarray:
+    """(n,) values of the frame's points out of (N,) of the cloud; -1 where there are none yet."""
+    if values is None:
+        return np.full(len(frame.rows), -1)
+    return np.asarray(values)[frame.rows]
+
+
+def _height_above_ground(frame: Frame, detections: Detections | None) -> np.ndarray:
+    """(n,) m above the plane, or above the lowest points where there is no answer yet."""
+    x, y, z = frame.xyz.astype(np.float64).T
+    if detections is None:
+        return z - (np.percentile(z, _LOW_PERCENTILE) if len(z) else 0)
+    a, b, c = np.asarray(detections.ground.coefficients, np.float64)
+    return z - (a * x + b * y + c)
+
+
+def _inside_any(xyz: np.ndarray, boxes: BoxSet) -> np.ndarray:
+    """(n,) bool: within one of the boxes, or a hand's breadth outside."""
+    inside = np.zeros(len(xyz), bool)
+    for center, size, yaw in zip(boxes.center, boxes.size, boxes.yaw.tolist(), strict=True):
+        x, y, z = (xyz - center).T
+        along, across = np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x
+        half = size / 2 + _LABEL_MARGIN_M
+        inside |= (abs(along) < half[0]) & (abs(across) < half[1]) & (abs(z) < half[2])
+    return inside

@@ -1,0 +1,243 @@
+"""The traced thresholds that the page has sliders for: none of them recompiles when it moves."""
+
+import dataclasses
+from collections.abc import Callable, Mapping
+
+from jaxbox.config import DetectorConfig
+from jaxbox.settings import traced_settings
+
+
+def _always(_: DetectorConfig) -> bool:
+    return True
+
+
+def _with_filter(config: DetectorConfig) -> bool:
+    return config.filtering.enabled
+
+
+def _with_surface(config: DetectorConfig) -> bool:
+    return config.ground.surface
+
+
+def _with_slab(config: DetectorConfig) -> bool:
+    return config.box.fit_to == "slab"
+
+
+def _with_evidence(config: DetectorConfig) -> bool:
+    return config.evidence.enabled
+
+
+def _with_hypotheses(config: DetectorConfig) -> bool:
+    return config.completion.mode == "evidence"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Threshold:
+    """One slider."""
+
+    name: str
+    """Dotted, of a traced setting."""
+    label: str
+    """A few words, for the page."""
+    hint: str
+    """What it does, in a sentence."""
+    low: float
+    """Left end."""
+    high: float
+    """Right end."""
+    step: float
+    """Between two stops."""
+    matters: Callable[[DetectorConfig], bool] = _always
+    """Whether settings use it at all: some presets leave the stage out."""
+
+    def value(self, config: DetectorConfig) -> float:
+        """What settings have for it.
+
+        >>> THRESHOLDS["ground"][0].value(DetectorConfig())
+        0.1
+        """
+        return float(traced_settings(config)[self.name])
+
+
+THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
+    "filter": (
+        Threshold(
+            name="filtering.num_std",
+            label="deviations",
+            hint="A point farther from its centroid than the mean and so many deviations is an outlier.",
+            low=0.5,
+            high=16.0,
+            step=0.5,
+            matters=_with_filter,
+        ),
+        Threshold(
+            name="filtering.min_density",
+            label="density",
+            hint="Points with less weight of points round them are outliers; a point alone weighs 1.",
+            low=0.0,
+            high=10.0,
+            step=0.1,
+            matters=_with_filter,
+        ),
+    ),
+    "ground": (
+        Threshold(
+            name="ground.tolerance_m",
+            label="tolerance (m)",
+            hint="A candidate within this of a plane speaks for it.",
+            low=0.01,
+            high=0.5,
+            step=0.01,
+        ),
+        Threshold(
+            name="ground.min_height_m",
+            label="from height (m)",
+            hint="Points higher above the ground than this are obstacles.",
+            low=0.0,
+            high=1.0,
+            step=0.01,
+        ),
+        Threshold(
+            name="ground.max_height_m",
+            label="to height (m)",
+            hint="Points higher above the ground than this are overhead, and left out.",
+            low=1.0,
+            high=8.0,
+            step=0.1,
+        ),
+        Threshold(
+            name="ground.max_grade",
+            label="grade (m/m)",
+            hint="Steepest rise of the ground relative to its plane.",
+            low=0.0,
+            high=0.3,
+            step=0.01,
+            matters=_with_surface,
+        ),
+    ),
+    "clusters": (
+        Threshold(
+            name="clustering.min_points",
+            label="points from",
+            hint="Clusters with fewer points are left out.",
+            low=1.0,
+            high=100.0,
+            step=1.0,
+        ),
+        Threshold(
+            name="clustering.max_extent_m",
+            label="extent to (m)",
+            hint="Clusters longer than this along x or y are left out.",
+            low=2.0,
+            high=30.0,
+            step=0.5,
+        ),
+        Threshold(
+            name="clustering.adaptive_start_m",
+            label="grows from (m)",
+            hint="Range from which the linking distance grows.",
+            low=0.0,
+            high=60.0,
+            step=1.0,
+        ),
+        Threshold(
+            name="clustering.adaptive_growth",
+            label="growth (1/m)",
+            hint="Growth of the linking distance with range; 0 keeps it fixed.",
+            low=0.0,
+            high=0.05,
+            step=0.001,
+        ),
+    ),
+    "boxes": (
+        Threshold(
+            name="box.slab_min_height_m",
+            label="slab from (m)",
+            hint="Only points higher above the ground than this shape the rectangle.",
+            low=0.0,
+            high=1.0,
+            step=0.05,
+            matters=_with_slab,
+        ),
+        Threshold(
+            name="box.slab_max_height_m",
+            label="slab to (m)",
+            hint="Only points lower above the ground than this shape the rectangle.",
+            low=0.3,
+            high=3.0,
+            step=0.05,
+            matters=_with_slab,
+        ),
+        Threshold(
+            name="completion.free_length_weight",
+            label="free area",
+            hint="Cost of the share of a box that the beams have seen to be free.",
+            low=0.0,
+            high=8.0,
+            step=0.1,
+            matters=_with_hypotheses,
+        ),
+        Threshold(
+            name="completion.seen_weight",
+            label="seen sides",
+            hint="What the measured size of a side seen whole weighs against the class's usual size.",
+            low=0.0,
+            high=1.0,
+            step=0.05,
+            matters=_with_hypotheses,
+        ),
+    ),
+    "score": (
+        Threshold(
+            name="vehicles.min_score",
+            label="score from",
+            hint="Boxes that score less are left out of the answer.",
+            low=0.0,
+            high=1.0,
+            step=0.01,
+        ),
+        Threshold(
+            name="vehicles.max_overlap",
+            label="overlap to",
+            hint="Of two boxes that overlap more (intersection over union from above), the better stays.",
+            low=0.0,
+            high=1.0,
+            step=0.01,
+        ),
+        Threshold(
+            name="vehicles.free_scale",
+            label="free rays",
+            hint="The smaller, the more it costs a box that rays pass through it.",
+            low=0.01,
+            high=1.0,
+            step=0.01,
+            matters=_with_evidence,
+        ),
+        Threshold(
+            name="vehicles.ring_weight",
+            label="ring",
+            hint="What points just outside a box cost it.",
+            low=0.0,
+            high=40.0,
+            step=0.5,
+        ),
+        Threshold(
+            name="vehicles.upright_worth",
+            label="upright",
+            hint="Worth of a box whose upper points are all on its faces, such as a wall's or a hedge's.",
+            low=0.0,
+            high=1.0,
+            step=0.05,
+        ),
+        Threshold(
+            name="vehicles.objective_gate",
+            label="objective",
+            hint="Boxes that explain the beams worse than this score low.",
+            low=0.0,
+            high=6.0,
+            step=0.1,
+            matters=_with_hypotheses,
+        ),
+    ),
+}
+"""Sliders by stage, in the order of the stages."""

@@ -1,0 +1,184 @@
+"""What the page says, as HTML. Names come from files and may hold anything, so every word is escaped."""
+
+import datetime
+import html
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxbox.types import Detections, Label, Status
+from jaxbox.viewer.frames import Frame
+from jaxbox.viewer.session import Session, Shown
+
+_COUNTS = (
+    ("ground_points", "ground"),
+    ("clustered_points", "clustered"),
+    ("unclustered_points", "in no cluster"),
+    ("overhead_points", "overhead"),
+    ("out_of_range_points", "out of range"),
+    ("outlier_points", "outliers"),
+    ("nonfinite_points", "not finite"),
+    ("dropped_points", "beyond the capacity"),
+    ("dropped_obstacles", "beyond max_obstacles"),
+)
+_STYLE = "padding: 0.3em 0.75em; font-size: 0.9em; line-height: 1.45; overflow-wrap: anywhere;"
+_QUIET, _WARNING, _ERROR = "#8a93a0", "#ffbe28", "#ff6b6b"
+
+
+def describe(shown: Shown, session: Session, *, index: int, min_score: float) -> str:
+    """The sweep, the vehicles, the times and the compiles.
+
+    Args:
+      shown: what is on the page.
+      session: that made it.
+      index: number of the sweep, from 0.
+      min_score: boxes that score less are hidden.
+
+    Returns:
+      HTML.
+    """
+    frame = shown.frame
+    keep = _keep(shown.detections, min_score)
+    total = int(np.asarray(shown.detections.valid).sum())
+    noun = "vehicle" if keep.sum() == 1 else "vehicles"
+    times = "time" if session.num_compiles == 1 else "times"
+    return _block(
+        [
+            _heading(frame, index, len(session)),
+            f"<b><span data-jaxbox='vehicles'>{int(keep.sum())}</span> {noun}</b>: "
+            f"{_classes(shown.detections, keep)}",
+            _quiet(f"{total} boxes of any score in the answer"),
+            f"<b><span data-jaxbox='milliseconds'>{shown.detect_s * 1e3:.1f}</span> ms</b> to detect, "
+            f"{frame.read_s * 1e3:.0f} ms to read {frame.num_points:,} points",
+            _quiet(
+                f"compiled <span data-jaxbox='compiles'>{session.num_compiles}</span> {times}, "
+                f"{session.compile_s:.1f} s in all"
+            ),
+        ]
+    )
+
+
+def describe_status(shown: Shown) -> str:
+    """What was dropped, and what could not be read beside the points.
+
+    Args:
+      shown: what is on the page.
+
+    Returns:
+      HTML: a sentence each, or one that says that there is nothing.
+    """
+    sentences = [*Status(int(shown.detections.status)).describe(), *shown.frame.problems]
+    if not sentences:
+        return _block([_quiet("nothing was dropped")], name="status")
+    return _block([_colored(html.escape(text), _WARNING) for text in sentences], name="status")
+
+
+def describe_points(shown: Shown) -> str:
+    """Where every point of the sweep went.
+
+    Args:
+      shown: what is on the page.
+
+    Returns:
+      HTML: a table.
+    """
+    total = max(shown.frame.num_points, 1)
+    counts = [(word, int(getattr(shown.detections.counts, name))) for name, word in _COUNTS]
+    rows = "".join(
+        f"<tr><td>{word}</td><td style='text-align: right; padding-left: 1em'>{count:,}</td>"
+        f"<td style='text-align: right; padding-left: 1em'>{count / total:.1%}</td></tr>"
+        for word, count in counts
+        if count
+    )
+    return _block([f"<table>{rows}</table>"], name="points")
+
+
+def describe_work(text: str, *, index: int, count: int, frame: Frame | None = None) -> str:
+    """What is being done, while there is no answer.
+
+    Args:
+      text: what, in words.
+      index: number of the sweep, from 0.
+      count: how many there are.
+      frame: the sweep, where it is read already.
+
+    Returns:
+      HTML.
+    """
+    heading = _quiet(f"{index + 1} of {count}") if frame is None else _heading(frame, index, count)
+    return _block([heading, html.escape(text)])
+
+
+def describe_error(message: str, *, index: int, count: int) -> str:
+    """An error in place of an answer.
+
+    Args:
+      message: what went wrong, and the mend.
+      index: number of the sweep, from 0.
+      count: how many there are.
+
+    Returns:
+      HTML.
+    """
+    return _block([_quiet(f"{index + 1} of {count}"), _colored(html.escape(message), _ERROR)], name="error")
+
+
+def copy_box(text: str) -> str:
+    """A text that can be read, and a button that puts it on the clipboard.
+
+    Args:
+      text: any.
+
+    Returns:
+      HTML. Where the browser refuses the clipboard to the page, as it does without encryption from another
+      machine, the text is selected, and the browser's own command copies it.
+    """
+    copy = (
+        "const text = this.parentElement.querySelector('textarea'); text.select();"
+        "(navigator.clipboard ? navigator.clipboard.writeText(text.value)"
+        " : Promise.resolve(document.execCommand('copy')))"
+        ".then(() => { this.textContent = 'copied'; },"
+        " () => { this.textContent = 'selected: copy it with Ctrl+C'; });"
+    )
+    lines = min(max(text.count("\n") + 1, 4), 24)
+    return (
+        f"<div><textarea data-jaxbox='settings' readonly rows='{lines}' spellcheck='false' "
+        "style='width: 100%; font-family: monospace; font-size: 0.85em'>"
+        f"{html.escape(text)}</textarea>"
+        f'<button style="padding: 0.3em 1em; cursor: pointer" onclick="{copy}">copy</button></div>'
+    )
+
+
+def _block(lines: Sequence[str], *, name: str = "answer") -> str:
+    body = "".join(f"<div>{line}</div>" for line in lines)
+    return f"<div data-jaxbox='{name}' style='{_STYLE}'>{body}</div>"
+
+
+def _colored(text: str, color: str) -> str:
+    return f"<span style='color: {color}'>{text}</span>"
+
+
+def _quiet(text: str) -> str:
+    return _colored(text, _QUIET)
+
+
+def _heading(frame: Frame, index: int, count: int) -> str:
+    place = f"{index + 1} of {count}"
+    if frame.timestamp_ns is not None:
+        seconds, nanoseconds = divmod(frame.timestamp_ns, 10**9)
+        moment = datetime.datetime.fromtimestamp(seconds, tz=datetime.UTC)
+        place += f", {moment:%Y-%m-%d %H:%M:%S}.{nanoseconds // 10**6:03d} UTC"
+    return f"<b data-jaxbox='name'>{html.escape(frame.name)}</b> {_quiet(place)}"
+
+
+def _keep(detections: Detections, min_score: float) -> np.ndarray:
+    return np.asarray(detections.valid) & (np.asarray(detections.score, np.float64) >= min_score)
+
+
+def _classes(detections: Detections, keep: np.ndarray) -> str:
+    counts = Counter(Label(label) for label in np.asarray(detections.label)[keep].tolist())
+    parts = [
+        f"{counts[label]} {label.name.lower()}{'s' * (counts[label] > 1)}" for label in Label if counts[label]
+    ]
+    return ", ".join(parts) or "none"
