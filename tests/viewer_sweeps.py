@@ -8,13 +8,16 @@ from jaxbox.synthetic import SyntheticSweep
 from jaxbox.viz import save_png
 
 
-def write_kitti(folder: pathlib.Path, name: str, sweep: SyntheticSweep) -> pathlib.Path:
+def write_kitti(
+    folder: pathlib.Path, name: str, sweep: SyntheticSweep, *, pedestrian: bool = True
+) -> pathlib.Path:
     """Writes points, calibration and image, and the truth in it as labels, the last one as a pedestrian."""
     truth = sweep.boxes
     types = [Label(int(label)).name.capitalize() for label in truth.label]
     found = io.objects_from_boxes(truth.center, truth.size, truth.yaw, sweep.calibration, types=types)
     objects = [item for item in found if item is not None]
-    objects[-1] = dataclasses.replace(objects[-1], type="Pedestrian")
+    if pedestrian:
+        objects[-1] = dataclasses.replace(objects[-1], type="Pedestrian")
     io.write_bin(folder / "velodyne" / f"{name}.bin", sweep.xyz, sweep.intensity)
     io.write_calibration(folder / "calib" / f"{name}.txt", sweep.calibration)
     io.write_labels(folder / "label_2" / f"{name}.txt", objects)

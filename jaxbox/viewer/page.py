@@ -21,6 +21,7 @@ _POINT_RANGE_M, _POINT_STEP_M = (0.01, 0.2), 0.01
 _RATES = (1.0, 30.0)
 _BRAND = (255, 190, 40)
 _FINEST = 1e-6
+_BOX_FONT, _LABEL_FONT = 0.8, 0.6
 _PLAY, _PAUSE = "play", "pause"
 _COPY, _DOWNLOAD, _RESET = "copy", "download", "reset"
 _SWITCHES = (
@@ -191,7 +192,7 @@ class ViserPage:
     def _build_camera(self) -> tuple[Any, Any]:
         panel = self._gui.add_panel(visible=False)
         with panel.add_tab("Camera"):
-            picture = self._gui.add_image(np.zeros((1, 1, 3), np.uint8), format="jpeg")
+            picture = self._gui.add_html("")
         panel.float(x=MARGIN_PX, y=-MARGIN_PX, width=CAMERA_PX)
         return panel, picture
 
@@ -246,25 +247,22 @@ class ViserPage:
             extra.remove()
         del self._captions[len(captions) :]
         for row, caption in enumerate(captions):
-            if row < len(self._captions):
-                self._captions[row].text = caption.text
-                self._captions[row].position = caption.position
-                self._captions[row].anchor = _anchor(caption)
-            else:
-                handle = self._server.scene.add_label(
-                    f"/captions/{row}",
-                    caption.text,
-                    position=caption.position,
-                    anchor=_anchor(caption),
-                    font_screen_scale=0.8,
-                )
-                self._captions.append(handle)
+            props = {
+                "text": caption.text,
+                "position": caption.position,
+                "anchor": "top-center" if caption.below else "bottom-center",
+                "font_screen_scale": _LABEL_FONT if caption.below else _BOX_FONT,
+            }
+            if row == len(self._captions):
+                self._captions.append(self._server.scene.add_label(f"/captions/{row}", **props))
+            for name, value in props.items():
+                setattr(self._captions[row], name, value)
 
     def _draw_image(self, image: np.ndarray | None) -> None:
         self._camera_panel.visible = image is not None
         before = None if self._scene is None else self._scene.image
         if image is not None and (before is None or not np.array_equal(image, before)):
-            self._camera.image = image
+            self._camera.content = words.picture(image)
 
     def _remove(self, name: str) -> None:
         if node := self._nodes.pop(name, None):
@@ -292,10 +290,6 @@ def _look(client: Any, name: str) -> None:
     with client.atomic():
         client.camera.up_direction = (0.0, 0.0, 1.0)
         client.camera.position, client.camera.look_at = position, target
-
-
-def _anchor(caption: Caption) -> str:
-    return "top-center" if caption.below else "bottom-center"
 
 
 def _act(action: str, client: Any, viewer: Viewer) -> None:

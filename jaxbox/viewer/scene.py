@@ -240,11 +240,11 @@ def _height_above_ground(frame: Frame, detections: Detections | None) -> np.ndar
 
 
 def _inside_any(xyz: np.ndarray, boxes: BoxSet) -> np.ndarray:
-    """(n,) bool: within one of the boxes, or a hand's breadth outside."""
+    """(n,) bool: within one of the boxes, or a hand's breadth beside it; not below, where the road is."""
     inside = np.zeros(len(xyz), bool)
     for center, size, yaw in zip(boxes.center, boxes.size, boxes.yaw.tolist(), strict=True):
         x, y, z = (xyz - center).T
         along, across = np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x
-        half = size / 2 + _LABEL_MARGIN_M
-        inside |= (abs(along) < half[0]) & (abs(across) < half[1]) & (abs(z) < half[2])
+        beside = size[:2] / 2 + _LABEL_MARGIN_M
+        inside |= (abs(along) < beside[0]) & (abs(across) < beside[1]) & (abs(z) < size[2] / 2)
     return inside

@@ -1,10 +1,12 @@
 """What the page says, as HTML. Names come from files and may hold anything, so every word is escaped."""
 
+import base64
 import datetime
 import html
 from collections import Counter
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from jaxbox.types import Detections, Label, Status
@@ -23,6 +25,7 @@ _COUNTS = (
     ("dropped_obstacles", "beyond max_obstacles"),
 )
 _STYLE = "padding: 0.3em 0.75em; font-size: 0.9em; line-height: 1.45; overflow-wrap: anywhere;"
+_JPEG_QUALITY = 85
 _QUIET, _WARNING, _ERROR = "#8a93a0", "#ffbe28", "#ff6b6b"
 
 
@@ -148,6 +151,24 @@ def copy_box(text: str) -> str:
         f"{html.escape(text)}</textarea>"
         f'<button style="padding: 0.3em 1em; cursor: pointer" onclick="{copy}">copy</button></div>'
     )
+
+
+def picture(image: np.ndarray) -> str:
+    """A camera's image within the text itself.
+
+    Viser's own element for images fetches each from the browser's memory, and complains of those that are
+    replaced before they have been fetched, as in playing they are.
+
+    Args:
+      image: (h, w, 3) uint8, RGB.
+
+    Returns:
+      HTML.
+    """
+    _, encoded = cv2.imencode(".jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))
+    data = base64.b64encode(encoded.tobytes()).decode()
+    # Decoded at once, or the panel would be empty for a moment between two images.
+    return f"<img alt='camera' decoding='sync' style='width: 100%' src='data:image/jpeg;base64,{data}'>"
 
 
 def _block(lines: Sequence[str], *, name: str = "answer") -> str:
