@@ -1,54 +1,131 @@
 """Files read with errors a user can act on, and written whole or not at all."""
 
 import contextlib
+import json
 import math
 import os
 import pathlib
+import stat
 import tempfile
 from collections.abc import Iterator
-from typing import TextIO
+from typing import Any, TextIO
 
 
 class InputError(ValueError):
     """A file or folder that cannot be used; the message names it, the line or field, and the mend."""
 
 
-def read_text(path: str | os.PathLike[str]) -> str:
+MAX_SWEEP_BYTES = 2**30
+"""Of the points of one sweep, packed or unpacked, and of any other file that is read as a whole."""
+
+MAX_TEXT_BYTES = 2**28
+"""Of a text file, which takes several times its size while it is read."""
+
+
+_MAX_REASON = 200
+
+
+def check_file(path: str | os.PathLike[str], *, max_bytes: int | None = MAX_SWEEP_BYTES) -> int:
+    """Refuses what cannot be read to its end: pipes, devices, sockets, folders, and files beyond a bound.
+
+    Args:
+      path: of a file; a link to one is a file.
+      max_bytes: its bound; None for files that are read piece by piece.
+
+    Returns:
+      Its size, bytes.
+
+    Raises:
+      InputError: where it is missing, no plain file, or too large.
+    """
+    try:
+        found = os.stat(path)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: there is no such file; check the path.") from error
+    # A path with a NUL is a ValueError.
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({getattr(error, 'strerror', error)}).") from error
+    if not stat.S_ISREG(found.st_mode):
+        raise InputError(f"{path}: no plain file; copy what it stands for into a file, and give that.")
+    if max_bytes is not None and found.st_size > max_bytes:
+        raise InputError(
+            f"{path}: {found.st_size} bytes; at most {max_bytes} are read. Is it the file that was meant? "
+            "Split it if so."
+        )
+    return found.st_size
+
+
+def read_text(path: str | os.PathLike[str], *, max_bytes: int | None = MAX_TEXT_BYTES) -> str:
     """Reads a text file.
 
     Args:
       path: the file.
+      max_bytes: as `check_file`.
 
     Returns:
       Its text.
 
     Raises:
-      InputError: where it is missing, unreadable or not text.
+      InputError: where it is missing, unreadable, too large or not text.
     """
     try:
-        return read_bytes(path).decode("utf-8-sig")
+        return read_bytes(path, max_bytes=max_bytes).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file ({error.reason} at byte {error.start}).") from error
 
 
-def read_bytes(path: str | os.PathLike[str]) -> bytes:
+def read_bytes(path: str | os.PathLike[str], *, max_bytes: int | None = MAX_SWEEP_BYTES) -> bytes:
     """Reads a file.
 
     Args:
       path: the file.
+      max_bytes: as `check_file`.
 
     Returns:
       Its bytes.
 
     Raises:
-      InputError: where it is missing or unreadable.
+      InputError: where it is missing, unreadable or too large.
     """
+    check_file(path, max_bytes=max_bytes)
     try:
         return pathlib.Path(path).read_bytes()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file; check the path.") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}).") from error
+
+
+def parse_json(text: str, where: str) -> Any:
+    """Reads JSON.
+
+    Args:
+      text: the whole of it.
+      where: the file, for the error.
+
+    Returns:
+      What it holds.
+
+    Raises:
+      InputError: where it is not JSON, is nested without end, or has a number of thousands of digits.
+    """
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        place = f"{where}, line {error.lineno}" if "\n" in text else where
+        raise InputError(f"{place}: not JSON ({error.msg} at column {error.colno}).") from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{where}: JSON that cannot be read ({reason(error)}).") from error
+
+
+def reason(error: BaseException) -> str:
+    """What another library says of a broken file, as one short line: it may quote the file itself.
+
+    >>> reason(ValueError("first\\nsecond"))
+    'first'
+    >>> reason(EOFError())
+    'EOFError'
+    """
+    text = str(error)[: 2 * _MAX_REASON].strip().partition("\n")[0]
+    return (text if len(text) <= _MAX_REASON else f"{text[:_MAX_REASON]}...") or type(error).__name__
 
 
 def finite_number(text: str, name: str, where: str) -> float:

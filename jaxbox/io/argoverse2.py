@@ -11,17 +11,18 @@ Reference: Wilson et al., "Argoverse 2: Next generation datasets for self-drivin
 forecasting", NeurIPS Datasets and Benchmarks 2021.
 """
 
-import json
 import os
 import pathlib
+import struct
 from typing import Any
 
 import numpy as np
 
+from jaxbox.io._arrow_sizes import unpacked_bytes
 from jaxbox.io._extras import require
-from jaxbox.io._files import InputError, read_bytes, read_text
+from jaxbox.io._files import InputError, parse_json, read_bytes, read_text, reason
 from jaxbox.io.labelled import LabelledBoxes, check_count, finite_number, labelled_boxes
-from jaxbox.io.points import PointFormat, Points, check_num_points, named_points, read_bin
+from jaxbox.io.points import PointFormat, Points, check_num_points, check_unpacked, named_points, read_bin
 
 SENSOR_XYZ_M = (1.35, 0.0, 1.64)
 """The upper LiDAR in the vehicle's frame; cars of the fleet differ by centimetres."""
@@ -94,19 +95,30 @@ def _sensor_xyz_m(path: pathlib.Path) -> np.ndarray:
 
 def _read_table(path: str | os.PathLike[str], columns: tuple[str, ...]) -> dict[str, np.ndarray]:
     """Those of the columns that a Feather table has."""
-    feather = require("pyarrow.feather", extra="arrow", what="Feather files")
     arrow = require("pyarrow", extra="arrow", what="Feather files")
+    data = read_bytes(path)
     try:
-        with arrow.memory_map(str(path)) as source, arrow.ipc.open_file(source) as reader:
-            there = reader.schema.names
-            batches = [reader.get_batch(i).num_rows for i in range(reader.num_record_batches)]
-        check_num_points(sum(batches), str(path))
-        table = feather.read_table(path, columns=[name for name in columns if name in there])
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file; check the path.") from error
-    except (arrow.ArrowException, OSError) as error:
-        raise InputError(f"{path}: no readable Feather table ({error}); copy it again.") from error
-    return {name: table[name].to_numpy() for name in table.column_names}
+        check_unpacked(unpacked_bytes(data), str(path))
+        names = arrow.ipc.open_file(data).schema.names
+        wanted = [index for index, name in enumerate(names) if name in columns]
+        options = arrow.ipc.IpcReadOptions(included_fields=wanted, use_threads=False)
+        table = arrow.ipc.open_file(data, options=options).read_all()
+        check_num_points(table.num_rows, str(path))
+        # Arrow believes the offsets within a column, and would read wherever they point.
+        table.validate(full=True)
+        return {name: table[name].to_numpy() for name in table.column_names}
+    except InputError:
+        raise
+    # A type that is not known is a KeyError or NotImplementedError, and a name may be no text.
+    except (
+        arrow.ArrowException,
+        struct.error,
+        OSError,
+        ValueError,
+        LookupError,
+        NotImplementedError,
+    ) as error:
+        raise InputError(f"{path}: no readable Feather table ({reason(error)}); copy it again.") from error
 
 
 def feather_timestamp_ns(path: pathlib.Path) -> int | None:
@@ -168,10 +180,7 @@ def read_argoverse2_ground(path: str | os.PathLike[str], *, num_points: int | No
 
 
 def _read_records(path: str | os.PathLike[str]) -> list[Any]:
-    try:
-        entries = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}, line {error.lineno}: not JSON ({error.msg}).") from error
+    entries = parse_json(read_text(path), str(path))
     if not isinstance(entries, list):
         raise InputError(f"{path}: holds no list; give the annotations as a JSON list of records.")
     return entries

@@ -7,8 +7,10 @@ import tomllib
 from typing import Any
 
 from jaxbox.config import DetectorConfig
-from jaxbox.io._files import InputError, atomic_writer, read_text
+from jaxbox.io._files import InputError, atomic_writer, read_text, reason
 from jaxbox.settings import apply_settings, base_of, settings_to_toml, without_preset
+
+_MAX_BYTES = 2**20
 
 
 def read_config(path: str | os.PathLike[str], *, base: DetectorConfig | None = None) -> DetectorConfig:
@@ -44,15 +46,16 @@ def write_config(path: str | os.PathLike[str], config: DetectorConfig) -> None:
 
 
 def _parse(path: str | os.PathLike[str]) -> dict[str, Any]:
-    text = read_text(path)
+    text = read_text(path, max_bytes=_MAX_BYTES)
     kind, parse = (
         ("JSON", json.loads) if pathlib.Path(path).suffix.lower() == ".json" else ("TOML", tomllib.loads)
     )
     try:
         tables = parse(text)
-    except ValueError as error:
+    # Tables within tables without end.
+    except (ValueError, RecursionError) as error:
         raise InputError(
-            f"{path}: no {kind} ({error}); mend the line, or name the file by its kind."
+            f"{path}: no {kind} ({reason(error)}); mend the line, or name the file by its kind."
         ) from error
     if not isinstance(tables, dict):
         raise InputError(f'{path}: it must be one object of values by name: {{"box.criterion": "area"}}.')

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from jaxbox.io._extras import require
-from jaxbox.io._files import InputError
-from jaxbox.io.points import Points, check_num_points, named_points
+from jaxbox.io._files import InputError, reason
+from jaxbox.io.points import Points, check_num_points, named_points, record_dtype
 
 POINT_CLOUD = "foxglove.PointCloud"
 """Name of the schema of points."""
@@ -109,7 +109,7 @@ def decode_point_cloud(data: bytes, where: str) -> Points:
     try:
         cloud.ParseFromString(data)
     except Exception as error:  # protobuf's own error, whose module differs between its versions
-        raise InputError(f"{where}: the message cannot be read ({error}); it is damaged.") from error
+        raise InputError(f"{where}: the message cannot be read ({reason(error)}); it is damaged.") from error
     fields = {field.name: (_DTYPES.get(field.type, ""), field.offset) for field in cloud.fields}
     fields = {name: (kind, offset) for name, (kind, offset) in fields.items() if kind}
     ends = [offset + np.dtype(kind).itemsize for kind, offset in fields.values()]
@@ -123,7 +123,7 @@ def decode_point_cloud(data: bytes, where: str) -> Points:
         "offsets": [offset for _, offset in fields.values()],
         "itemsize": cloud.point_stride,
     }
-    points = np.frombuffer(cloud.data, np.dtype(layout), count)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    points = np.frombuffer(cloud.data, record_dtype(layout, where), count)
     return named_points({name: points[name] for name in fields}, where)
 
 

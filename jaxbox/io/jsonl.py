@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxbox.io._files import InputError, atomic_writer, read_text
+from jaxbox.io._files import InputError, atomic_writer, parse_json, read_text
 from jaxbox.io.results import ResultFile, WriteResult
 from jaxbox.types import Counts, Detections, Label, Status
 
@@ -83,15 +83,12 @@ def read_jsonl(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
     Raises:
       InputError: naming file and line, where a line is no JSON object.
     """
-    lines = enumerate(read_text(path).splitlines(), start=1)
+    lines = enumerate(read_text(path, max_bytes=None).splitlines(), start=1)
     return [_parse_line(line, f"{path}, line {number}") for number, line in lines if line.strip()]
 
 
 def _parse_line(line: str, where: str) -> dict[str, Any]:
-    try:
-        record = json.loads(line)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{where}: not JSON ({error.msg} at column {error.colno}).") from error
+    record = parse_json(line, where)
     if not isinstance(record, dict):
         raise InputError(f"{where}: not a JSON object; each line must be one sweep's {{...}}.")
     return record

@@ -24,6 +24,9 @@ CAMERA = 2
 RAW_CALIBRATION_FILES = ("calib_velo_to_cam.txt", "calib_cam_to_cam.txt")
 """In a raw recording's folder of the day."""
 
+_MAX_VALUE = 1e9
+"""Products of three values have to stay within float32's range."""
+
 
 def read_calibration(
     path: str | os.PathLike[str], *, camera: int = CAMERA, image_size_px: tuple[int, int] = IMAGE_SIZE_PX
@@ -121,7 +124,10 @@ def _matrix(
     words = entries[key]
     if len(words) != math.prod(shape):
         raise InputError(f"{path}: {key} has {len(words)} values; it must have {math.prod(shape)}.")
-    return np.array([finite_number(word, key, str(path)) for word in words]).reshape(shape)
+    values = np.array([finite_number(word, key, str(path)) for word in words]).reshape(shape)
+    if np.abs(values).max() > _MAX_VALUE:
+        raise InputError(f"{path}: {key} holds {np.abs(values).max():g}, which no camera has.")
+    return values
 
 
 def _calibration(

@@ -101,7 +101,8 @@ def finite_number(value: object, name: str, where: str) -> float:
     """
     try:
         number = float(value)  # pyright: ignore[reportArgumentType]
-    except (TypeError, ValueError):
+    # A whole number of hundreds of digits overflows.
+    except (TypeError, ValueError, OverflowError):
         number = math.nan
     if not math.isfinite(number):
         raise InputError(f"{where}: {name} is {value!r}; it must be a finite number.")

@@ -7,8 +7,15 @@ import struct
 import numpy as np
 
 from jaxbox.io._extras import require
-from jaxbox.io._files import InputError
-from jaxbox.io.points import PointFormat, Points, check_num_bytes, check_num_points, named_points
+from jaxbox.io._files import InputError, check_file, reason
+from jaxbox.io.points import (
+    PointFormat,
+    Points,
+    check_num_bytes,
+    check_num_points,
+    check_unpacked,
+    named_points,
+)
 
 MAP_DISTANCE_M = 10_000.0
 """Points whose median is farther from the origin than this are on a map, not round a sensor."""
@@ -35,23 +42,22 @@ def read_las(path: str | os.PathLike[str]) -> Points:
       ImportError: without the extra ``las``.
     """
     laspy = require("laspy", extra="las", what="LAS and LAZ files")
+    size = check_file(path)
     try:
-        size = os.stat(path).st_size
         _check_tables(pathlib.Path(path), size)
         with laspy.open(path) as reader:
             header = reader.header
             check_num_points(header.point_count, str(path))
+            needed = header.point_count * header.point_format.size
+            check_unpacked(needed, str(path))
             if not header.are_points_compressed:
-                needed = header.point_count * header.point_format.size
                 check_num_bytes(needed, size - header.offset_to_point_data, str(path))
             points = reader.read()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file; check the path.") from error
     except InputError:
         raise
     # laspy and its decoders raise whatever the bytes lead them to; lazrs even its own Rust errors.
     except Exception as error:
-        raise InputError(f"{path}: no readable LAS or LAZ file ({error}); copy it again.") from error
+        raise InputError(f"{path}: no readable LAS or LAZ file ({reason(error)}); copy it again.") from error
     columns = {name: np.asarray(getattr(points, name)) for name in ("x", "y", "z", "intensity")}
     _check_frame(columns, str(path))
     return named_points(columns, str(path))

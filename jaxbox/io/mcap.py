@@ -1,30 +1,29 @@
 """MCAP recordings: ``sensor_msgs/PointCloud2`` of ROS 2 (CDR) or ROS 1, and Foxglove's own point clouds.
 
-The `mcap` library finds the messages; those of ROS are decoded as in `jaxbox.io.rosbag`.
+A file, or a folder of ROS 2 whose storage is MCAP. `jaxbox.io.mcap_file` finds the messages; those of ROS are
+decoded as in `jaxbox.io.rosbag`.
 """
 
-import contextlib
 import functools
 import pathlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from jaxbox.io._extras import require
-from jaxbox.io._files import InputError
 from jaxbox.io.foxglove import POINT_CLOUD, decode_point_cloud
+from jaxbox.io.mcap_file import McapFile, open_mcap_file
 from jaxbox.io.pointcloud2 import MESSAGE_TYPES
 from jaxbox.io.points import Points
 from jaxbox.io.recordings import Message, RecordedSweeps, RecordingFormat, choose_topic
-from jaxbox.io.rosbag import MessageDecoder
+from jaxbox.io.rosbag import METADATA_NAME, MessageDecoder
 
-_RECORD_LIMIT_BYTES = 2**30
+_SUFFIX = ".mcap"
 
 
 def open_mcap(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
-    """Opens the sweeps of an MCAP file.
+    """Opens the sweeps of an MCAP file, or of a folder of them that is one recording of ROS 2.
 
     Args:
-      path: the file.
+      path: the file or folder.
       topic: of the points; None where there is only one.
 
     Returns:
@@ -34,71 +33,59 @@ def open_mcap(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
       InputError: where it is no such file, or the topic has to be named.
       ImportError: without the extra ``mcap``.
     """
-    with open_mcap_reader(path) as reader:
-        counts, others = _count_messages(reader)
-    chosen = choose_topic(path, topic, counts, others)
+    counts: dict[str, int] = {}
+    others: set[str] = set()
+    starts = {}
+    for file in sorted(_storage_files(path)) if path.is_dir() else [path]:
+        with open_mcap_file(file) as reader:
+            found, starts[file] = _count_messages(reader, others)
+        for name, count in found.items():
+            counts[name] = counts.get(name, 0) + count
+    chosen = choose_topic(path, topic, counts, sorted(others - counts.keys()))
+    # The names of a long recording's files are numbered, 10 before 2.
+    files = sorted(starts, key=lambda file: starts[file])
 
     def messages() -> Iterator[Message]:
-        with open_mcap_reader(path) as reader:
-            for schema, channel, message in reader.iter_messages(topics=[chosen]):
-                decoder = _decoder_of(schema, channel)
-                if decoder is not None:
-                    where = f"{path}, {chosen} at {message.log_time}"
-                    yield message.log_time, decoder(message.data, where)
+        for file in files:
+            with open_mcap_file(file) as reader:
+                for schema, channel, message in reader.iter_messages(chosen):
+                    decoder = _decoder_of(schema, channel)
+                    if decoder is not None:
+                        where = f"{file}, {chosen} at {message.log_time}"
+                        yield message.log_time, decoder(message.data, where)
 
     return RecordedSweeps(path, chosen, counts[chosen], messages)
 
 
-@contextlib.contextmanager
-def open_mcap_reader(path: pathlib.Path) -> Iterator[Any]:
-    """Opens an MCAP file; what library and decompressors raise on broken bytes becomes one kind of error.
-
-    Args:
-      path: the file.
-
-    Yields:
-      The library's reader.
-
-    Raises:
-      InputError: naming the file, where it cannot be read.
-      ImportError: without the extra ``mcap``.
-    """
-    module = require("mcap.reader", extra="mcap", what="MCAP files")
-    try:
-        with path.open("rb") as file:
-            yield module.SeekingReader(file, record_size_limit=_RECORD_LIMIT_BYTES)
-    except (InputError, ImportError):
-        raise
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file; check the path.") from error
-    except Exception as error:
-        reason = str(error) or type(error).__name__
-        raise InputError(
-            f"{path}: the MCAP file cannot be read ({reason}). Copy it again; `mcap recover` mends a "
-            "recording that was cut short."
-        ) from error
+def _storage_files(folder: pathlib.Path) -> list[pathlib.Path]:
+    return [file for file in folder.iterdir() if file.suffix.lower() == _SUFFIX and file.is_file()]
 
 
-def _count_messages(reader: Any) -> tuple[dict[str, int], list[str]]:
-    """Messages by topic of points, by the index or else by one pass; and the names of other topics."""
-    summary = reader.get_summary()
+def is_mcap_folder(path: pathlib.Path) -> bool:
+    """Whether a folder is a recording of ROS 2 whose storage is MCAP."""
+    return (path / METADATA_NAME).is_file() and bool(_storage_files(path))
+
+
+def _count_messages(reader: McapFile, others: set[str]) -> tuple[dict[str, int], int]:
+    """Messages by topic of points, and the first time, by the index or else by one pass; adds other topics."""
+    counts: dict[str, int] = {}
+    summary = reader.summary
     if summary is None or summary.statistics is None:
-        counts: dict[str, int] = {}
-        others = set()
-        for schema, channel, _ in reader.iter_messages():
+        start = 0
+        for schema, channel, message in reader.iter_messages():
+            start = min(start or message.log_time, message.log_time)
             if _decoder_of(schema, channel) is None:
                 others.add(channel.topic)
             else:
                 counts[channel.topic] = counts.get(channel.topic, 0) + 1
-        return counts, sorted(others - counts.keys())
-    counts, others = {}, []
+        return counts, start
     for channel in summary.channels.values():
         if _decoder_of(summary.schemas.get(channel.schema_id), channel) is None:
-            others.append(channel.topic)
+            others.add(channel.topic)
         else:
             number = summary.statistics.channel_message_counts.get(channel.id, 0)
             counts[channel.topic] = counts.get(channel.topic, 0) + number
-    return counts, others
+    return counts, summary.statistics.message_start_time
 
 
 def _decoder_of(schema: Any, channel: Any) -> Callable[[bytes, str], Callable[[], Points]] | None:
@@ -112,4 +99,4 @@ def _decoder_of(schema: Any, channel: Any) -> Callable[[bytes, str], Callable[[]
     return None
 
 
-MCAP = RecordingFormat(name="MCAP", suffixes=(".mcap",), open=open_mcap)
+MCAP = RecordingFormat(name="MCAP", suffixes=(_SUFFIX,), open=open_mcap, is_folder=is_mcap_folder)

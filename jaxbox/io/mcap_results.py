@@ -15,7 +15,7 @@ import numpy as np
 from jaxbox.io._extras import require
 from jaxbox.io._files import InputError, atomic_path
 from jaxbox.io.foxglove import point_cloud, scene_update
-from jaxbox.io.mcap import open_mcap_reader
+from jaxbox.io.mcap_file import open_mcap_file
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
 
 BOXES_TOPIC = "/jaxbox/boxes"
@@ -106,7 +106,7 @@ class _Channels:
 def _copy(path: pathlib.Path, channels: _Channels) -> int:
     """Copies an earlier file; returns how many sweeps it holds."""
     count = 0
-    with open_mcap_reader(path) as reader:
+    with open_mcap_file(path) as reader:
         for schema, channel, message in reader.iter_messages():
             channels.add_raw(schema, channel, message)
             count += channel.topic == RECORDS_TOPIC
@@ -128,11 +128,11 @@ def finished_mcap(path: pathlib.Path) -> frozenset[str]:
     """
     if not path.is_file():
         return frozenset()
-    with open_mcap_reader(path) as reader:
-        records = [json.loads(message.data) for _, _, message in reader.iter_messages(topics=[RECORDS_TOPIC])]
-    if not records:
+    with open_mcap_file(path) as reader:
+        names = [json.loads(message.data)["name"] for _, _, message in reader.iter_messages(RECORDS_TOPIC)]
+    if not names or not all(isinstance(name, str) for name in names):
         raise InputError(f"{path}: no MCAP file of jaxbox, as it has no {RECORDS_TOPIC}; move it away.")
-    return frozenset(record["name"] for record in records)
+    return frozenset(names)
 
 
 MCAP_RESULTS = ResultFile(

@@ -1,5 +1,6 @@
 """NumPy's own files: an array of points in .npy, or the array of that name in .npz."""
 
+import math
 import os
 import pathlib
 import tokenize
@@ -9,17 +10,16 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from jaxbox.io._files import InputError
-from jaxbox.io.points import MAX_POINTS, PointFormat, Points, named_points
+from jaxbox.io._files import InputError, check_file, reason
+from jaxbox.io.points import PointFormat, Points, check_num_points, check_unpacked, named_points
 
 ARRAY_NAMES = ("points", "xyz", "pointcloud", "data", "arr_0")
 """Arrays that are looked for in a .npz file of several, in this order; its only one needs no name."""
 
 _COLUMNS = ("x", "y", "z", "intensity")
-_MAX_VALUES = 64 * MAX_POINTS
 _READ_ERRORS = (
-    ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, SyntaxError,
-    tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+    ValueError, OSError, EOFError, KeyError, MemoryError, NotImplementedError, OverflowError, RuntimeError,
+    SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 """What NumPy and its parsers raise on broken bytes."""
 
@@ -36,15 +36,17 @@ def read_npy(path: str | os.PathLike[str]) -> Points:
     Raises:
       InputError: where it is no such array, or is cut short.
     """
+    check_file(path)
     try:
-        # A map, so that a header that claims more than the file holds asks for no memory.
-        points = np.load(path, mmap_mode="r", allow_pickle=False)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file; check the path.") from error
+        # A map, so that a header that claims more than the file holds asks for no memory; and not
+        # `np.load`, which takes archives and pickles too.
+        points = np.lib.format.open_memmap(path, mode="r")
     except _READ_ERRORS as error:
         if _is_empty_array(path):
             return np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
-        raise InputError(f"{path}: no readable .npy array ({error}); save it again with np.save.") from error
+        raise InputError(
+            f"{path}: no readable .npy array ({reason(error)}); save it again with np.save."
+        ) from error
     return _array_points(points, str(path))
 
 
@@ -52,7 +54,7 @@ def _is_empty_array(path: str | os.PathLike[str]) -> bool:
     """Whether this is a whole file of an array without values, which cannot be mapped."""
     try:
         with pathlib.Path(path).open("rb") as file:
-            return 0 in _read_shape(file)
+            return 0 in _read_header(file)[0]
     except _READ_ERRORS:
         return False
 
@@ -71,6 +73,7 @@ def read_npz(path: str | os.PathLike[str]) -> Points:
     Raises:
       InputError: where it is no such file, or holds no such array.
     """
+    check_file(path)
     try:
         with np.load(path, allow_pickle=False) as arrays:
             if {"x", "y", "z"} <= set(arrays.files):
@@ -80,12 +83,13 @@ def read_npz(path: str | os.PathLike[str]) -> Points:
             for name in names:
                 _check_member(arrays.zip, f"{name}.npy", str(path))
             found = {name: arrays[name] for name in names}
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file; check the path.") from error
     except InputError:
         raise
-    except (*_READ_ERRORS, AttributeError) as error:
-        raise InputError(f"{path}: no readable .npz file ({error}); save it again with np.savez.") from error
+    # A file of another kind is no archive, which shows as the lack of an attribute, or of a context.
+    except (*_READ_ERRORS, AttributeError, TypeError) as error:
+        raise InputError(
+            f"{path}: no readable .npz file ({reason(error)}); save it again with np.savez."
+        ) from error
     if len(found) > 1:
         return named_points(found, str(path))
     return _array_points(next(iter(found.values())), str(path))
@@ -105,20 +109,25 @@ def _array_name(names: list[str], where: str) -> str:
 def _check_member(archive: Any, member: str, where: str) -> None:
     """Refuses an array larger than what the archive says it unpacks to."""
     with archive.open(member) as file:
-        shape = _read_shape(file)
-    if np.prod(shape, dtype=float) > min(_MAX_VALUES, archive.getinfo(member).file_size):
+        shape, dtype = _read_header(file)
+    num_bytes = math.prod(shape) * dtype.itemsize
+    check_unpacked(num_bytes, where)
+    if num_bytes > archive.getinfo(member).file_size:
         raise InputError(f"{where}: {member} claims the shape {shape}, more than is there; save it again.")
 
 
-def _read_shape(file: BinaryIO) -> tuple[int, ...]:
+def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:
+    """Shape and type of an array."""
     version = np.lib.format.read_magic(file)
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in read:
         raise ValueError(f"version {version} of the format")
-    return read[version](file)[0]
+    shape, _, dtype = read[version](file)
+    return shape, dtype
 
 
 def _array_points(points: np.ndarray, where: str) -> Points:
+    check_num_points(len(points) if points.ndim else 0, where)
     if points.dtype.names and points.ndim == 1:
         return named_points({name: points[name] for name in points.dtype.names}, where)
     if points.ndim != 2 or points.shape[1] < len("xyz") or points.dtype.kind not in "fiu":

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from jaxbox.io._extras import require
-from jaxbox.io._files import InputError, atomic_path
+from jaxbox.io._files import InputError, atomic_path, reason
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
 
 PARQUET_COLUMNS: Mapping[str, str] = {
@@ -51,8 +51,7 @@ def open_parquet(path: pathlib.Path, resume: bool = False) -> Iterator[WriteResu
     rows: list[dict[str, Any]] = []
     with atomic_path(path) as temporary, parquet.ParquetWriter(temporary, schema) as writer:
         if resume and path.is_file():
-            for batch in parquet.ParquetFile(path).iter_batches():
-                writer.write_batch(batch)
+            _copy(path, writer)
 
         def flush() -> None:
             if rows:
@@ -68,6 +67,20 @@ def open_parquet(path: pathlib.Path, resume: bool = False) -> Iterator[WriteResu
         yield write
         flush()
         writer.add_key_value_metadata({SWEEPS_KEY: json.dumps(names)})
+
+
+def _copy(path: pathlib.Path, writer: Any) -> None:
+    """Carries the rows of an earlier file over."""
+    arrow = require("pyarrow", extra="arrow", what="Parquet files")
+    parquet = require("pyarrow.parquet", extra="arrow", what="Parquet files")
+    try:
+        with parquet.ParquetFile(path) as earlier:
+            for batch in earlier.iter_batches():
+                batch.validate(full=True)
+                writer.write_batch(batch)
+    # Bytes that are no such table, or a table with other columns.
+    except (arrow.ArrowException, OSError, ValueError) as error:
+        raise InputError(f"{path}: its rows cannot be read ({reason(error)}); move it away.") from error
 
 
 def box_rows(record: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -113,9 +126,12 @@ def finished_parquet(path: pathlib.Path) -> frozenset[str]:
     parquet = require("pyarrow.parquet", extra="arrow", what="Parquet files")
     try:
         metadata = parquet.read_metadata(path).metadata or {}
-        return frozenset(json.loads(metadata[SWEEPS_KEY.encode()]))
-    except (arrow.ArrowException, KeyError, ValueError) as error:
-        raise InputError(f"{path}: no Parquet file of jaxbox ({error!r}); move it away.") from error
+        names = json.loads(metadata[SWEEPS_KEY.encode()])
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"{SWEEPS_KEY} is no list of names")
+        return frozenset(names)
+    except (arrow.ArrowException, OSError, KeyError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: no Parquet file of jaxbox ({reason(error)}); move it away.") from error
 
 
 PARQUET = ResultFile(name="detections.parquet", open=open_parquet, finished=finished_parquet)

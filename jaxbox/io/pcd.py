@@ -13,11 +13,19 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from jaxbox.io._extras import require
-from jaxbox.io._files import InputError
-from jaxbox.io.points import PointFormat, Points, check_num_bytes, check_num_points, named_points
+from jaxbox.io._files import InputError, check_file, reason
+from jaxbox.io.points import (
+    PointFormat,
+    Points,
+    check_num_bytes,
+    check_num_points,
+    check_unpacked,
+    named_points,
+)
 
 _MAX_HEADER_LINES = 64
 _MAX_LINE_BYTES = 65536
+_MAX_FIELDS = 1024
 _LENGTHS = struct.Struct("<II")
 _LZF_BEST_RATIO = 100
 """LZF codes at most 264 bytes in 3."""
@@ -37,22 +45,22 @@ def read_pcd(path: str | os.PathLike[str]) -> Points:
       ImportError: without the extra ``pcd``.
     """
     pypcd4 = require("pypcd4", extra="pcd", what="PCD files")
-    try:
-        with pathlib.Path(path).open("rb") as file:
-            lines = _read_header_lines(file, str(path))
-            header = _parse_header(lines, pypcd4, str(path))
-            check_num_points(header.points, str(path))
-            if header.data.value == "ascii":
-                return named_points(_read_ascii(file, header, str(path)), str(path))
-            _check_body(file, header, pathlib.Path(path))
-            whole = io.BytesIO("\n".join([*lines, ""]).encode() + file.read())
-            try:
-                cloud = pypcd4.PointCloud.from_fileobj(whole).pc_data
-            # The decompressor answers None for broken bytes, which pypcd4 takes the length of.
-            except (ValueError, TypeError, RuntimeError, struct.error) as error:
-                raise InputError(f"{path}: the points cannot be read ({error}); copy it again.") from error
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file; check the path.") from error
+    size = check_file(path)
+    with pathlib.Path(path).open("rb") as file:
+        lines = _read_header_lines(file, str(path))
+        header = _parse_header(lines, pypcd4, str(path))
+        check_num_points(header.points, str(path))
+        if header.data.value == "ascii":
+            return named_points(_read_ascii(file, header, str(path)), str(path))
+        _check_body(file, header, size, str(path))
+        whole = io.BytesIO("\n".join([*lines, ""]).encode() + file.read())
+        try:
+            cloud = pypcd4.PointCloud.from_fileobj(whole).pc_data
+        # For broken bytes the decompressor answers None, which pypcd4 takes the length of, or MemoryError.
+        except (ValueError, TypeError, RuntimeError, MemoryError, struct.error) as error:
+            raise InputError(
+                f"{path}: the points cannot be read ({reason(error)}); copy it again."
+            ) from error
     return named_points({name: cloud[name] for name in cloud.dtype.names}, str(path))
 
 
@@ -76,6 +84,9 @@ def _read_header_lines(file: BinaryIO, where: str) -> list[str]:
 def _parse_header(lines: list[str], pypcd4: Any, where: str) -> Any:
     try:
         header = pypcd4.MetaData.parse_header(lines)
+        # pypcd4 makes a field of each value.
+        if sum(header.count) > _MAX_FIELDS:
+            raise ValueError(f"{sum(header.count)} values a point")
         header.build_dtype()
     except (ValueError, KeyError, IndexError, TypeError) as error:
         problem = "; ".join(str(error).splitlines()[:3])
@@ -83,21 +94,22 @@ def _parse_header(lines: list[str], pypcd4: Any, where: str) -> Any:
     return header
 
 
-def _check_body(file: BinaryIO, header: Any, path: pathlib.Path) -> None:
+def _check_body(file: BinaryIO, header: Any, size: int, where: str) -> None:
     """Holds the sizes in header and body against the file's."""
-    there = path.stat().st_size - file.tell()
+    there = size - file.tell()
     needed = header.points * header.build_dtype().itemsize
+    check_unpacked(needed, where)
     if header.data.value == "binary":
-        check_num_bytes(needed, there, str(path))
+        check_num_bytes(needed, there, where)
     elif header.points:
         lengths = file.read(_LENGTHS.size)
         file.seek(-len(lengths), os.SEEK_CUR)
-        check_num_bytes(_LENGTHS.size, len(lengths), str(path))
+        check_num_bytes(_LENGTHS.size, len(lengths), where)
         compressed, uncompressed = _LENGTHS.unpack(lengths)
-        check_num_bytes(compressed, there - _LENGTHS.size, str(path))
+        check_num_bytes(compressed, there - _LENGTHS.size, where)
         if uncompressed != needed or uncompressed > _LZF_BEST_RATIO * compressed:
             raise InputError(
-                f"{path}: {compressed} compressed bytes are to make {uncompressed}, and the header's points "
+                f"{where}: {compressed} compressed bytes are to make {uncompressed}, and the header's points "
                 f"take {needed}. The file is damaged: copy or convert it again."
             )
 

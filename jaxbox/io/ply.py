@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from jaxbox.io._files import InputError
+from jaxbox.io._files import InputError, check_file, reason
 from jaxbox.io.points import PointFormat, Points, check_num_bytes, check_num_points, named_points
 
 _MAX_HEADER_LINES = 1024
@@ -36,19 +36,16 @@ def read_ply(path: str | os.PathLike[str]) -> Points:
     Raises:
       InputError: where it is no PLY file, is cut short, does not begin with its vertices, or has no x, y, z.
     """
-    path = pathlib.Path(path)
-    try:
-        with path.open("rb") as file:
-            order, count, dtype = _read_header(file, str(path))
-            check_num_points(count, str(path))
-            if order:
-                size = count * dtype.itemsize
-                check_num_bytes(size, path.stat().st_size - file.tell(), str(path))
-                vertices = np.frombuffer(file.read(size), dtype)
-            else:
-                vertices = _read_ascii(file, count, dtype, str(path))
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: there is no such file; check the path.") from error
+    there = check_file(path)
+    with pathlib.Path(path).open("rb") as file:
+        order, count, dtype = _read_header(file, str(path))
+        check_num_points(count, str(path))
+        if order:
+            size = count * dtype.itemsize
+            check_num_bytes(size, there - file.tell(), str(path))
+            vertices = np.frombuffer(file.read(size), dtype)
+        else:
+            vertices = _read_ascii(file, count, dtype, str(path))
     return named_points({name: vertices[name] for name in dtype.names or ()}, str(path))
 
 
@@ -76,7 +73,13 @@ def _read_header(file: BinaryIO, where: str) -> tuple[str, int, np.dtype]:
     ]
     if unknown := [name for name, kind in fields if not kind.lstrip("<>")]:
         raise InputError(f"{where}: vertex property {unknown[0]} is no number; leave it out.")
-    return order, int(vertex[1]), np.dtype(fields)
+    try:
+        return order, int(vertex[1]), np.dtype(fields)
+    # A name that occurs twice, or a number of thousands of digits.
+    except ValueError as error:
+        raise InputError(
+            f"{where}: the PLY header cannot be read ({reason(error)}); write it again."
+        ) from error
 
 
 def _read_ascii(file: BinaryIO, count: int, dtype: np.dtype, where: str) -> np.ndarray:

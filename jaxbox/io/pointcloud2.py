@@ -7,7 +7,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from jaxbox.io._files import InputError
-from jaxbox.io.points import Points, check_num_bytes, check_num_points, named_points
+from jaxbox.io.points import Points, check_num_bytes, check_num_points, named_points, record_dtype
 
 MESSAGE_TYPES = ("sensor_msgs/msg/PointCloud2", "sensor_msgs/PointCloud2")
 """Names of the message in ROS 2 and ROS 1."""
@@ -101,4 +101,4 @@ def _point_dtype(message: PointCloud2, where: str) -> np.dtype:
             formats.append(kind)
             offsets.append(field.offset)
     layout = {"names": names, "formats": formats, "offsets": offsets, "itemsize": message.point_step}
-    return np.dtype(layout)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    return record_dtype(layout, where)

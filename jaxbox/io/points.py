@@ -1,13 +1,15 @@
 """Points as the formats share them, and the two formats without a library: KITTI's binary, and text."""
 
+import array
 import dataclasses
 import os
 import pathlib
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
 
-from jaxbox.io._files import InputError, atomic_path, read_bytes, read_text
+from jaxbox.io._files import MAX_SWEEP_BYTES, InputError, atomic_path, read_bytes, read_text, reason
 
 _VALUES_PER_POINT = 4
 _BYTES_PER_POINT = _VALUES_PER_POINT * np.dtype("<f4").itemsize
@@ -15,8 +17,8 @@ _BYTES_PER_POINT = _VALUES_PER_POINT * np.dtype("<f4").itemsize
 Points = tuple[np.ndarray, np.ndarray]
 """xyz (n, 3) float32, m, and intensity (n,) float32."""
 
-MAX_POINTS = 2**27
-"""No sensor makes more in a sweep; a file that claims so is broken, and is refused before it is read."""
+MAX_POINTS = 2**24
+"""Sixteen times the largest capacity; a file that claims more is broken, and is refused before it is read."""
 
 INTENSITY_NAMES = ("intensity", "reflectivity", "reflectance", "remission", "scalar_intensity", "i")
 """Names that the formats give to the strength of a return; the first that is there is taken."""
@@ -67,6 +69,25 @@ def named_points(columns: Mapping[str, np.ndarray], where: str) -> Points:
         return xyz, intensity.astype(np.float32)
 
 
+def record_dtype(layout: Mapping[str, Any], where: str) -> np.dtype:
+    """The type of a point, from names, formats, offsets and itemsize.
+
+    Args:
+      layout: as `numpy.dtype` takes it.
+      where: the message, for the error.
+
+    Returns:
+      The type.
+
+    Raises:
+      InputError: where NumPy knows no such type, as of points of gigabytes.
+    """
+    try:
+        return np.dtype(dict(layout))  # pyright: ignore[reportArgumentType, reportCallIssue]
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{where}: the layout of a point makes no sense ({reason(error)}).") from error
+
+
 def check_num_points(claimed: int, where: str) -> None:
     """Refuses what cannot be the size of a sweep, before memory is asked for.
 
@@ -81,6 +102,23 @@ def check_num_points(claimed: int, where: str) -> None:
         raise InputError(
             f"{where}: the header claims {claimed} points; a sweep has at most {MAX_POINTS}. "
             "The file is damaged: copy or convert it again."
+        )
+
+
+def check_unpacked(num_bytes: int, where: str) -> None:
+    """Refuses what would unpack to more than any sweep takes, before it is unpacked.
+
+    Args:
+      num_bytes: unpacked, as far as is known.
+      where: the file, for the error.
+
+    Raises:
+      InputError: for more than `MAX_SWEEP_BYTES`.
+    """
+    if num_bytes > MAX_SWEEP_BYTES:
+        raise InputError(
+            f"{where}: it unpacks to {num_bytes} bytes or more; at most {MAX_SWEEP_BYTES} are read. "
+            "The file is damaged, or made to fill the memory."
         )
 
 
@@ -177,15 +215,15 @@ def read_text_points(path: str | os.PathLike[str]) -> Points:
       InputError: naming file and line, for a line that is not numbers, or has fewer than three columns
         or another number than the first.
     """
-    lines = read_text(path).replace(",", " ").splitlines()
-    rows = [(number, line.split()) for number, line in enumerate(lines, start=1)]
-    rows = [(number, words) for number, words in rows if words and not words[0].startswith("#")]
-    if rows and _is_header(rows[0][1]):
-        rows = rows[1:]
-    if not rows:
-        return np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
-    columns = len(rows[0][1])
-    points = np.array([_parse_point(words, columns, f"{path}, line {number}") for number, words in rows])
+    columns, values = 0, array.array("d")
+    for number, line in enumerate(read_text(path).replace(",", " ").splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#") or (not columns and _is_header(words)):
+            continue
+        columns = columns or len(words)
+        values.extend(_parse_point(words, columns, f"{path}, line {number}"))
+    points = np.array(values).reshape(-1, _VALUES_PER_POINT)
+    check_num_points(len(points), str(path))
     # A number beyond float32's range becomes infinite, and is counted by the detector.
     with np.errstate(over="ignore"):
         points = points.astype(np.float32)

@@ -5,17 +5,25 @@ distribution, and many bags hold none.
 """
 
 import contextlib
+import functools
 import pathlib
 from collections.abc import Iterator
 from typing import Any
 
 from jaxbox.io._extras import require
-from jaxbox.io._files import InputError
+from jaxbox.io._files import InputError, check_file, reason
+from jaxbox.io._unpack import unpack
 from jaxbox.io.pointcloud2 import MESSAGE_TYPES, decode_pointcloud2
 from jaxbox.io.points import Points
 from jaxbox.io.recordings import Message, RecordedSweeps, RecordingFormat, choose_topic
 
+METADATA_NAME = "metadata.yaml"
+"""What a folder of ROS 2 holds beside its storage."""
+
 _TYPE = MESSAGE_TYPES[0]
+_PACKED_MESSAGES = "message"
+_MAX_PACKED_RATIO = 100
+_PIECE_BYTES = 2**20
 
 
 def open_rosbag(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
@@ -39,11 +47,11 @@ def open_rosbag(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
     def messages() -> Iterator[Message]:
         with _reader(path) as reader:
             connections = [c for c in reader.connections if c.topic == chosen and c.msgtype == _TYPE]
-            for _, timestamp_ns, data in reader.messages(connections):
-                yield (
-                    timestamp_ns,
-                    MessageDecoder(data, f"{path}, {chosen} at {timestamp_ns}", _is_ros1(path)),
-                )
+            is_packed = not _is_ros1(path) and reader.compression_mode == _PACKED_MESSAGES
+            for _, timestamp_ns, data in _raw_messages(reader, connections):
+                where = f"{path}, {chosen} at {timestamp_ns}"
+                message = unpack(data, "zstd", where) if is_packed else data
+                yield timestamp_ns, MessageDecoder(message, where, _is_ros1(path))
 
     return RecordedSweeps(path, chosen, counts[chosen], messages)
 
@@ -56,16 +64,52 @@ def _is_ros1(path: pathlib.Path) -> bool:
 def _reader(path: pathlib.Path) -> Iterator[Any]:
     """The bag, with whatever `rosbags` and its decoders raise on broken bytes as one kind of error."""
     module = require("rosbags.rosbag1" if _is_ros1(path) else "rosbags.rosbag2", extra="ros", what="ROS bags")
+    for file in path.iterdir() if path.is_dir() else (path,):
+        check_file(file, max_bytes=None)
     try:
+        _check_packed_files(path)
         with module.Reader(path) as reader:
+            if _is_ros1(path):
+                _bound_chunks(reader, str(path))
             yield reader
     except (InputError, ImportError):
         raise
     except Exception as error:
         raise InputError(
-            f"{path}: the bag cannot be read ({error}). Copy it again; `rosbag reindex` or "
+            f"{path}: the bag cannot be read ({reason(error)}). Copy it again; `rosbag reindex` or "
             "`ros2 bag reindex` mends a recording that was cut short."
         ) from error
+
+
+def _bound_chunks(reader: Any, where: str) -> None:
+    """Lets chunks of ROS 1 be unpacked with a bound in place of the library's own functions."""
+    known = require("rosbags.rosbag1.reader", extra="ros", what="ROS bags").decompressors
+    names = {function: name for name, function in known.items()}
+    for position, chunk in reader.chunks.items():
+        bounded = functools.partial(unpack, compression=names[chunk.decompressor], where=where)
+        reader.chunks[position] = chunk._replace(decompressor=bounded)
+
+
+def _raw_messages(reader: Any, connections: Any) -> Iterator[Any]:
+    """Messages of a bag, as they are stored: the library would unpack those of ROS 2 without a bound."""
+    storage = getattr(reader, "storage", None)
+    if getattr(storage, "metadata", None) is not None and reader.compression_mode == _PACKED_MESSAGES:
+        storage.metadata = storage.metadata._replace(compression_mode=None)
+    return reader.messages(connections)
+
+
+def _check_packed_files(path: pathlib.Path) -> None:
+    """Refuses a ROS 2 folder whose packed files would fill the disk, where the library unpacks them."""
+    for file in path.glob("*.zstd") if path.is_dir() else ():
+        size, bound = 0, _MAX_PACKED_RATIO * file.stat().st_size
+        with require("rosbags.rosbag2.reader", extra="ros", what="ROS bags").zstd.open(file) as packed:
+            while piece := packed.read(_PIECE_BYTES):
+                size += len(piece)
+                if size > bound:
+                    raise InputError(
+                        f"{file}: it unpacks to more than {_MAX_PACKED_RATIO} times its size. "
+                        "The file is damaged, or made to fill the disk."
+                    )
 
 
 class MessageDecoder:
@@ -81,23 +125,28 @@ class MessageDecoder:
           InputError: naming recording, topic and time.
           ImportError: without the extra ``ros``.
         """
-        typesys = require("rosbags.typesys", extra="ros", what="ROS messages")
-        stores = typesys.Stores
-        store = typesys.get_typestore(stores.ROS1_NOETIC if self._is_ros1 else stores.ROS2_HUMBLE)
+        store = _typestore(self._is_ros1)
         deserialize = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
         try:
             message = deserialize(self._data, _TYPE)
         # The library's own errors, or what generated code meets in too few bytes.
         except Exception as error:
             raise InputError(
-                f"{self._where}: the message cannot be read ({error}); it is damaged."
+                f"{self._where}: the message cannot be read ({reason(error)}); it is damaged."
             ) from error
         return decode_pointcloud2(message, self._where)
 
 
+@functools.cache
+def _typestore(is_ros1: bool) -> Any:
+    """The definitions of all messages, which take longer to gather than a message to decode."""
+    typesys = require("rosbags.typesys", extra="ros", what="ROS messages")
+    return typesys.get_typestore(typesys.Stores.ROS1_NOETIC if is_ros1 else typesys.Stores.ROS2_HUMBLE)
+
+
 def is_rosbag2(path: pathlib.Path) -> bool:
     """Whether a folder is a recording of ROS 2."""
-    return (path / "metadata.yaml").is_file()
+    return (path / METADATA_NAME).is_file()
 
 
 ROSBAG = RecordingFormat(

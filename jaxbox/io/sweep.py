@@ -1,17 +1,21 @@
 """One sweep, wherever it lies: its name, its time, and readers of what belongs to it."""
 
 import dataclasses
+import os
 import pathlib
 from collections.abc import Callable
 
 import numpy as np
 
+from jaxbox.io._files import InputError
 from jaxbox.io.images import read_image
 from jaxbox.io.kitti import KittiObject, read_labels
 from jaxbox.io.kitti_calibration import IMAGE_SIZE_PX, read_calibration, read_raw_calibration
 from jaxbox.io.points import Points
 from jaxbox.io.registry import read_points
 from jaxbox.types import Calibration
+
+_END_OF_TIME_NS = 2**63
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,9 +36,27 @@ class Sweep:
     frame: int | None = None
     """Frame within the sequence, which picks this sweep's lines of a tracking label file."""
     timestamp_ns: int | None = None
-    """When it was taken, ns since 1970, as far as file name or recording say; None where they do not."""
+    """When it was taken, ns since 1970, as far as file name or recording say; None where they do not, or
+    where it is before 1970 or after 2262, which the results' integers of 64 bits end with."""
     decode: Callable[[], Points] | None = dataclasses.field(default=None, repr=False, compare=False)
     """Decodes the points of a sweep within a recording; None where `points_path` holds this sweep alone."""
+
+    def __post_init__(self) -> None:
+        """Keeps what a file or index claims within what results can hold.
+
+        Raises:
+          InputError: for a name that would lead out of the folder of the results.
+        """
+        if "\0" in self.name or self.name != pathlib.PurePath(self.name).name or self.name == "..":
+            raise InputError(
+                f"{self.points_path}: its sweep would be named {self.name!r}, and results are named by it; "
+                "rename the file, or give a name without folders."
+            )
+        # Bytes of a file's name that are no UTF-8 can neither be printed nor written.
+        printable = os.fsencode(self.name).decode("utf-8", "backslashreplace")
+        object.__setattr__(self, "name", printable)
+        if self.timestamp_ns is not None and not 0 <= self.timestamp_ns < _END_OF_TIME_NS:
+            object.__setattr__(self, "timestamp_ns", None)
 
     def read_points(self) -> Points:
         """Reads the points.

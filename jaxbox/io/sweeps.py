@@ -26,7 +26,7 @@ import pathlib
 from collections.abc import Iterator, Sequence
 from typing import overload
 
-from jaxbox.io._files import InputError, read_text
+from jaxbox.io._files import InputError, check_file, read_text
 from jaxbox.io.kitti import tracking_name
 from jaxbox.io.kitti_calibration import RAW_CALIBRATION_FILES
 from jaxbox.io.mcap import MCAP
@@ -36,8 +36,8 @@ from jaxbox.io.registry import POINT_FORMATS, POINT_SUFFIXES, format_of, suffix_
 from jaxbox.io.rosbag import ROSBAG
 from jaxbox.io.sweep import Sweep
 
-RECORDING_FORMATS: tuple[RecordingFormat, ...] = (ROSBAG, MCAP)
-"""The recordings that `open_sweeps` knows."""
+RECORDING_FORMATS: tuple[RecordingFormat, ...] = (MCAP, ROSBAG)
+"""The recordings that `open_sweeps` knows; a folder of ROS 2 whose storage is MCAP is read as MCAP."""
 
 RECORDING_SUFFIXES: tuple[str, ...] = tuple(
     suffix for recording_format in RECORDING_FORMATS for suffix in recording_format.suffixes
@@ -107,6 +107,8 @@ def _open_path(path: pathlib.Path, topic: str | None) -> list[Sequence[Sweep]]:
             raise InputError(f"{path}: not a known kind of points; give one of {known}.")
         return [(_sweep_at(path),)]
     if not path.is_dir():
+        if path.exists():
+            check_file(path, max_bytes=None)
         raise InputError(f"{path}: there is no such file or folder; check the path.")
     if files := _find_points(path, POINT_FORMATS[:-1]):
         return [tuple(_sweep_at(file) for file in files)]

@@ -1,0 +1,478 @@
+"""What the fuzzer reads: every reader of `jaxbox.io`, with small files that the formats' own libraries write."""
+
+import contextlib
+import dataclasses
+import importlib
+import json
+import pathlib
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import cv2
+import laspy
+import numpy as np
+import plyfile
+import pyarrow as pa
+import pyarrow.feather
+import pypcd4
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from rosbags import rosbag1, rosbag2
+from rosbags.typesys import Stores, get_typestore
+
+from jaxbox import DetectorConfig, io
+from jaxbox.cli.results import RunAccount
+from jaxbox.io import foxglove
+from jaxbox.io.jsonl import JSONL
+from jaxbox.io.mcap_results import MCAP_RESULTS
+from jaxbox.io.parquet import PARQUET
+from jaxbox.io.results import ResultFile, SweepResult
+from jaxbox.io.rosbag import MessageDecoder
+from jaxbox.settings import settings_to_toml
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+STORES = {1: get_typestore(Stores.ROS1_NOETIC), 2: get_typestore(Stores.ROS2_HUMBLE)}
+NUM_POINTS = 12
+POINTS = np.random.default_rng(0).uniform(-30, 30, (NUM_POINTS, 5)).astype(np.float32)
+"""x, y, z, intensity, ring."""
+NAMES = ("x", "y", "z", "intensity", "ring")
+TIME_NS = 10**18
+RECORD = {
+    "name": "a",
+    "timestamp_ns": TIME_NS,
+    "boxes": [
+        {"label": "car", "score": 0.5, "center": [9.0, 1.0, -1.0], "size": [4.0, 1.7, 1.5], "yaw": 0.1,
+         "num_points": 99},
+    ],
+    "status": [],
+    "counts": {"points": 12},
+}  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """A reader and what it is fed with."""
+
+    file_name: str
+    """Of the file that holds the bytes; its suffix chooses the reader."""
+    read: Callable[[pathlib.Path], object]
+    """Reads that file; may raise `jaxbox.io.InputError`, and nothing else."""
+    seeds: Callable[[], Mapping[str, bytes]]
+    """Makes whole files to begin with."""
+    known: Callable[[pathlib.Path], None] = lambda _: None
+    """Writes the files that belong to it, into its folder."""
+
+
+# --- points ---------------------------------------------------------------------------------------
+
+
+def read_sweeps(path: pathlib.Path) -> None:
+    """Every sweep at a path; a damaged message among others is an error of its own."""
+    for sweep in io.open_sweeps(path):
+        with contextlib.suppress(io.InputError):
+            check_points(*sweep.read_points())
+
+
+def check_points(xyz: np.ndarray, intensity: np.ndarray) -> None:
+    """What every reader of points promises."""
+    assert xyz.shape == (len(intensity), 3), (xyz.shape, intensity.shape)
+    assert xyz.dtype == intensity.dtype == np.float32
+
+
+def points_target(suffix: str, seeds: Callable[[pathlib.Path], object]) -> Target:
+    """A file of one sweep; the seeds are what is written into a folder, all of that suffix."""
+    return Target(f"a{suffix}", lambda path: check_points(*io.read_points(path)), lambda: written(seeds))
+
+
+def written(write: Callable[[pathlib.Path], object]) -> dict[str, bytes]:
+    """The files that something writes into a folder."""
+    with tempfile.TemporaryDirectory() as root:
+        write(pathlib.Path(root))
+        files = sorted(path for path in pathlib.Path(root).rglob("*") if path.is_file())
+        return {str(path.relative_to(root)).replace("/", "_"): path.read_bytes() for path in files}
+
+
+def write_text(folder: pathlib.Path) -> None:
+    """With and without a header, with blanks and commas."""
+    np.savetxt(folder / "a.xyz", POINTS, fmt="%.3f")
+    np.savetxt(folder / "b.xyz", POINTS[:, :3], fmt="%.3f", delimiter=",", header="x,y,z", comments="")
+
+
+def write_pcd(folder: pathlib.Path) -> None:
+    """The three encodings, with columns of several types."""
+    for encoding in ("ascii", "binary", "binary_compressed"):
+        types = (np.float32, np.float32, np.float64, np.float32, np.uint16)
+        columns = [column.astype(kind) for column, kind in zip(np.abs(POINTS.T), types, strict=True)]
+        cloud = pypcd4.PointCloud.from_points(columns, NAMES, types)
+        cloud.save(folder / f"{encoding}.pcd", encoding=pypcd4.Encoding(encoding))
+
+
+def write_ply(folder: pathlib.Path) -> None:
+    """Text and both byte orders, with a face behind the vertices."""
+    vertices = np.rec.fromarrays(POINTS.T, dtype=[(name, "f4") for name in NAMES])
+    face = np.array([([0, 1, 2],)], [("vertex_indices", "i4", (3,))])
+    elements = [plyfile.PlyElement.describe(vertices, "vertex"), plyfile.PlyElement.describe(face, "face")]
+    for name, text, order in (("ascii", True, "="), ("little", False, "<"), ("big", False, ">")):
+        plyfile.PlyData(elements, text=text, byte_order=order).write(folder / f"{name}.ply")
+
+
+def write_las(folder: pathlib.Path, suffix: str) -> None:
+    """Two versions and point formats."""
+    for version, point_format in (("1.2", 1), ("1.4", 6)):
+        las = laspy.LasData(laspy.LasHeader(point_format=point_format, version=version))
+        las.x, las.y, las.z = POINTS[:, :3].T.astype(float)
+        las.intensity = np.arange(NUM_POINTS)
+        las.write(folder / f"{version}{suffix}")
+
+
+def write_npy(folder: pathlib.Path) -> None:
+    """A matrix, one in Fortran's order, and records."""
+    np.save(folder / "a.npy", POINTS)
+    np.save(folder / "b.npy", np.asfortranarray(POINTS.astype(np.float64)))
+    np.save(folder / "c.npy", np.rec.fromarrays(POINTS.T, names=",".join(NAMES)))
+
+
+def write_npz(folder: pathlib.Path) -> None:
+    """A matrix, named columns, and several arrays; stored and compressed."""
+    np.savez(folder / "a.npz", POINTS)
+    np.savez(folder / "b.npz", **dict(zip(NAMES, POINTS.T, strict=True)))
+    np.savez_compressed(folder / "c.npz", points=POINTS, labels=np.arange(3))
+
+
+def write_feather(folder: pathlib.Path) -> None:
+    """Plain and compressed tables of half floats, as of Argoverse 2."""
+    columns = {name: POINTS[:, index].astype(np.float16) for index, name in enumerate("xyz")}
+    table = pa.table({**columns, "intensity": np.arange(NUM_POINTS, dtype=np.uint8)})
+    for compression in ("uncompressed", "lz4", "zstd"):
+        pa.feather.write_feather(table, folder / f"{compression}.feather", compression=compression)
+
+
+def write_feather_calibration(folder: pathlib.Path) -> None:
+    """Where the sensors are."""
+    place = {"tx_m": [0.0, 1.25], "ty_m": [0.0, 0.5], "tz_m": [0.0, 2.0]}
+    table = pa.table({"sensor_name": ["down_lidar", "up_lidar"], **place})
+    pa.feather.write_feather(table, folder / "a.feather", compression="uncompressed")
+
+
+def read_calibrated_feather(path: pathlib.Path) -> None:
+    """A good sweep beside a calibration of these bytes."""
+    check_points(*io.read_points(path.parents[1] / "sensors" / "lidar" / "1.feather"))
+
+
+def write_log(folder: pathlib.Path) -> None:
+    """The good sweep, in the folders of a log."""
+    lidar = folder.parent / "sensors" / "lidar"
+    lidar.mkdir(parents=True, exist_ok=True)
+    (lidar / "1.feather").write_bytes(written(write_feather)["uncompressed.feather"])
+
+
+# --- recordings -----------------------------------------------------------------------------------
+
+
+def make_message(ros: int) -> Any:
+    """A PointCloud2 of all the points."""
+    types = STORES[ros].types
+    time = types["builtin_interfaces/msg/Time"](sec=1, nanosec=2)
+    header = {"stamp": time, "frame_id": "lidar"} | ({"seq": 0} if ros == 1 else {})
+    field = types["sensor_msgs/msg/PointField"]
+    return types[CLOUD](
+        header=types["std_msgs/msg/Header"](**header),
+        height=1,
+        width=NUM_POINTS,
+        fields=[field(name=name, offset=4 * i, datatype=7, count=1) for i, name in enumerate(NAMES)],
+        is_bigendian=False,
+        point_step=POINTS.itemsize * POINTS.shape[1],
+        row_step=POINTS.nbytes,
+        data=np.frombuffer(POINTS.tobytes(), np.uint8),
+        is_dense=True,
+    )
+
+
+def serialized(ros: int) -> bytes:
+    """The message's bytes in ROS 1 or ROS 2."""
+    store = STORES[ros]
+    return bytes((store.serialize_ros1 if ros == 1 else store.serialize_cdr)(make_message(ros), CLOUD))
+
+
+def write_bag1(folder: pathlib.Path) -> None:
+    """Plain, bz2 and lz4 chunks."""
+    for compression in (None, *rosbag1.Writer.CompressionFormat):
+        writer = rosbag1.Writer(folder / f"{compression.name if compression else 'plain'}.bag")
+        if compression:
+            writer.set_compression(compression)
+        with writer:
+            connection = writer.add_connection("/points", CLOUD, typestore=STORES[1], msgdef="")
+            for index in range(2):
+                writer.write(connection, TIME_NS + index, serialized(1))
+
+
+def write_bag2(folder: pathlib.Path, storage: str = "SQLITE3", compression: str | None = None) -> None:
+    """A folder of ROS 2."""
+    plugin = getattr(rosbag2.StoragePlugin, storage)
+    writer = rosbag2.Writer(folder / "drive", version=9, storage_plugin=plugin)
+    if compression:
+        mode = getattr(rosbag2.CompressionMode, compression)
+        writer.set_compression(mode, rosbag2.CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/points", CLOUD, typestore=STORES[2])
+        for index in range(2):
+            writer.write(connection, TIME_NS + index, serialized(2))
+
+
+def bag2_files(suffix: str, **options: Any) -> dict[str, bytes]:
+    """Those files of a ROS 2 folder that end so."""
+    files = written(lambda folder: write_bag2(folder, **options))
+    return {name: data for name, data in files.items() if name.endswith(suffix)}
+
+
+def write_storage(folder: pathlib.Path, **options: Any) -> None:
+    """The storage that the metadata names."""
+    with tempfile.TemporaryDirectory() as root:
+        write_bag2(pathlib.Path(root), **options)
+        for file in pathlib.Path(root, "drive").iterdir():
+            (folder / file.name).write_bytes(file.read_bytes())
+
+
+def write_mcap(folder: pathlib.Path) -> None:
+    """ROS 2 with each compression and without an index, and Foxglove's own messages."""
+    for compression in CompressionType:
+        for indexed in (True, False):
+            name = f"{compression.name}{'' if indexed else '_unindexed'}.mcap"
+            with (folder / name).open("wb") as file:
+                writer = McapWriter(
+                    file, compression=compression, use_statistics=indexed, use_summary_offsets=indexed
+                )
+                writer.start()
+                schema = writer.register_schema(CLOUD, "ros2msg", b"")
+                channel = writer.register_channel("/points", "cdr", schema)
+                for index in range(2):
+                    writer.add_message(channel, TIME_NS + index, serialized(2), TIME_NS)
+                writer.finish()
+    with (folder / "foxglove.mcap").open("wb") as file:
+        options = {"compression": CompressionType.NONE}
+        writer = importlib.import_module("mcap_protobuf.writer").Writer(file, **options)
+        writer.write_message("/points", foxglove_message(), TIME_NS, TIME_NS)
+        writer.finish()
+
+
+def foxglove_message() -> Any:
+    """A ``foxglove.PointCloud``."""
+    return foxglove.point_cloud(POINTS[:, :3], POINTS[:, 3], timestamp_ns=TIME_NS, frame_id="lidar")
+
+
+def read_message(path: pathlib.Path) -> None:
+    """The bytes of one message of ROS 2, and of ROS 1."""
+    data = path.read_bytes()
+    for is_ros1 in (False, True):
+        with contextlib.suppress(io.InputError):
+            check_points(*MessageDecoder(data, "here", is_ros1)())
+
+
+# --- labels, calibrations and settings ------------------------------------------------------------
+
+
+def read_boxes(boxes: io.LabelledBoxes) -> None:
+    """What every reader of boxes promises."""
+    assert np.isfinite(boxes.center).all()
+    assert (boxes.size[:, 0] >= boxes.size[:, 1]).all()
+    assert ((-np.pi / 2 <= boxes.yaw) & (boxes.yaw < np.pi / 2)).all()
+
+
+def argoverse2_json() -> bytes:
+    """A list of one box."""
+    names = ("tx_m", "ty_m", "tz_m", "length_m", "width_m", "height_m", "qw", "qx", "qy", "qz")
+    return json.dumps([{"category": "BUS", **dict.fromkeys(names, 1.0)}]).encode()
+
+
+LABEL = "Car 0.00 0 -1.57 614.2 181.8 727.3 284.8 1.57 1.73 4.15 1.00 1.75 13.22 -1.62"
+LABELS = {
+    "object": f"{LABEL}\n{LABEL} 0.5\nDontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10\n".encode(),
+    "tracking": f"0 -1 {LABEL}\n1 7 {LABEL}\n".encode(),
+}
+IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"
+CALIBRATION = (
+    f"P2: 700 0 600 45 0 700 180 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: {IDENTITY}\n"
+)
+RAW_CALIBRATION = {
+    "calib_velo_to_cam.txt": "R: 1 0 0 0 1 0 0 0 1\nT: 0 0 0\n",
+    "calib_cam_to_cam.txt": "S_rect_02: 1242 375\nR_rect_00: 1 0 0 0 1 0 0 0 1\n"
+    "P_rect_02: 700 0 600 45 0 700 180 0 0 0 1 0\n",
+}
+
+
+def raw_calibration_target(name: str) -> Target:
+    """One of the two files, beside a good other one."""
+
+    def write_other(folder: pathlib.Path) -> None:
+        for other, text in RAW_CALIBRATION.items():
+            (folder / other).write_text(text)
+
+    seeds = {name: RAW_CALIBRATION[name].encode()}
+    return Target(name, lambda path: io.read_raw_calibration(path.parent), lambda: seeds, write_other)
+
+
+def write_raw_drive(folder: pathlib.Path) -> None:
+    """A sweep of a raw drive, whose times are beside its folder."""
+    (folder / "data").mkdir(exist_ok=True)
+    (folder / "data" / "0000000000.bin").write_bytes(b"")
+
+
+def read_label_lines(path: pathlib.Path) -> None:
+    """Labels, and their boxes where they have any."""
+    for item in io.read_labels(path):
+        assert np.isfinite(item.location).all()
+    io.read_label_folder(path.parent)
+
+
+def write_image(folder: pathlib.Path) -> None:
+    """The two kinds that the data sets have."""
+    image = np.arange(8 * 6 * 3, dtype=np.uint8).reshape(6, 8, 3)
+    for suffix in (".png", ".jpg"):
+        cv2.imwrite(str(folder / f"a{suffix}"), image)
+
+
+# --- results that are read back -------------------------------------------------------------------
+
+
+def result_target(kind: ResultFile) -> Target:
+    """A result file of an earlier run, looked into and carried over."""
+
+    def write(folder: pathlib.Path) -> None:
+        with kind.open(folder / kind.name, False) as add:
+            add(SweepResult(record=RECORD))
+
+    def read(path: pathlib.Path) -> None:
+        assert kind.finished is not None
+        names = kind.finished(path)
+        assert all(isinstance(name, str) for name in names)
+        data = path.read_bytes()
+        try:
+            with kind.open(path, True) as add:
+                add(SweepResult(record=RECORD | {"name": "b"}))
+        except io.InputError:
+            assert path.read_bytes() == data, "what cannot be continued stays as it was"
+
+    return Target(kind.name, read, lambda: written(write))
+
+
+def account(folder: pathlib.Path) -> RunAccount:
+    """Of a run with these settings."""
+    return RunAccount(output=folder, config=DetectorConfig(), options={"min_score": 0.0}, inputs=("a",))
+
+
+def run_seeds(folder: pathlib.Path) -> None:
+    """Only ``run.json`` of what a run writes."""
+    account(folder).write(finished=True)
+    (folder / "config.toml").unlink()
+
+
+def write_run_config(folder: pathlib.Path) -> None:
+    """The settings beside ``run.json``."""
+    io.write_config(folder / "config.toml", DetectorConfig())
+
+
+TARGETS: Mapping[str, Target] = {
+    "bin": points_target(".bin", lambda folder: io.write_bin(folder / "a.bin", POINTS[:, :3])),
+    "nuscenes": points_target(".pcd.bin", lambda f: (f / "a.pcd.bin").write_bytes(POINTS.tobytes())),
+    "text": points_target(".xyz", write_text),
+    "pcd": points_target(".pcd", write_pcd),
+    "ply": points_target(".ply", write_ply),
+    "las": points_target(".las", lambda folder: write_las(folder, ".las")),
+    "laz": points_target(".laz", lambda folder: write_las(folder, ".laz")),
+    "npy": points_target(".npy", write_npy),
+    "npz": points_target(".npz", write_npz),
+    "feather": points_target(".feather", write_feather),
+    "feather_calibration": Target(
+        "calibration/egovehicle_SE3_sensor.feather",
+        read_calibrated_feather,
+        lambda: written(write_feather_calibration),
+        write_log,
+    ),
+    "rosbag1": Target("a.bag", read_sweeps, lambda: written(write_bag1)),
+    "rosbag2_db3": Target("a.db3", read_sweeps, lambda: bag2_files(".db3")),
+    "rosbag2_metadata": Target(
+        "drive/metadata.yaml",
+        lambda path: read_sweeps(path.parent),
+        lambda: bag2_files(".yaml"),
+        write_storage,
+    ),
+    "rosbag2_mcap": Target(
+        "drive/drive.mcap",
+        lambda path: read_sweeps(path.parent),
+        lambda: bag2_files(".mcap", storage="MCAP"),
+        lambda folder: write_storage(folder, storage="MCAP"),
+    ),
+    "mcap": Target("a.mcap", read_sweeps, lambda: written(write_mcap)),
+    "ros_message": Target("a.cdr", read_message, lambda: {"ros2": serialized(2), "ros1": serialized(1)}),
+    "foxglove_message": Target(
+        "a.pb",
+        lambda path: check_points(*foxglove.decode_point_cloud(path.read_bytes(), "here")),
+        lambda: {"cloud": foxglove_message().SerializeToString()},
+    ),
+    "argoverse2_boxes": Target(
+        "a.json",
+        lambda path: read_boxes(io.read_argoverse2_boxes(path)),
+        lambda: {"boxes": argoverse2_json()},
+    ),
+    "argoverse2_ground": Target("a.u8", io.read_argoverse2_ground, lambda: {"flags": bytes([0, 1] * 8)}),
+    "pandaset_boxes": Target(
+        "a.txt",
+        lambda path: read_boxes(io.read_pandaset_boxes(path)),
+        lambda: {"boxes": b"Car 0 1 2 -1 4.5 1.8 1.5 0.3 12\nBus 0 9 2 -1 2.5 11 3 1.2\n"},
+    ),
+    "semantic_labels": Target("a.label", io.read_semantic_labels, lambda: {"labels": bytes(range(48))}),
+    "kitti_labels": Target("a.txt", read_label_lines, lambda: LABELS),
+    "kitti_calibration": Target("a.txt", io.read_calibration, lambda: {"calib": CALIBRATION.encode()}),
+    "kitti_raw_velo_to_cam": raw_calibration_target("calib_velo_to_cam.txt"),
+    "kitti_raw_cam_to_cam": raw_calibration_target("calib_cam_to_cam.txt"),
+    "kitti_raw_timestamps": Target(
+        "velodyne_points/timestamps.txt",
+        lambda path: io.open_sweeps(path.parent / "data"),
+        lambda: {"times": b"2011-09-26 13:02:25.594360375\n"},
+        write_raw_drive,
+    ),
+    "drives": Target(
+        "a.txt", lambda path: io.read_drives(path, ["1"]), lambda: {"drives": b"1 city # first\n2 road\n"}
+    ),
+    "image": Target("a.png", io.read_image, lambda: written(write_image)),
+    "config_toml": Target(
+        "a.toml", io.read_config, lambda: {"settings": settings_to_toml(DetectorConfig()).encode()}
+    ),
+    "config_json": Target(
+        "a.json", io.read_config, lambda: {"settings": b'{"preset": "paper", "vehicles.min_score": 0.1}'}
+    ),
+    "jsonl": result_target(JSONL),
+    "parquet": result_target(PARQUET),
+    "mcap_results": result_target(MCAP_RESULTS),
+    "run_json": Target(
+        "run.json",
+        lambda path: account(path.parent).check_resumable(),
+        lambda: written(run_seeds),
+        write_run_config,
+    ),
+}
+"""Every reader, by the name that `fuzz_readers` knows it by."""
+
+
+@contextlib.contextmanager
+def prepared(target: Target, root: pathlib.Path) -> Iterator[Callable[[bytes], None]]:
+    """Lends a function that feeds the reader with bytes, by way of a file below a folder.
+
+    Args:
+      target: the reader.
+      root: an empty folder.
+
+    Yields:
+      What reads bytes; it raises what the reader may not, and passes over `jaxbox.io.InputError`.
+    """
+    path = root / target.file_name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    target.known(path.parent)
+
+    def read(data: bytes) -> None:
+        path.write_bytes(data)
+        with contextlib.suppress(io.InputError):
+            target.read(path)
+
+    yield read
