@@ -90,7 +90,8 @@ def in_child(work: Callable[[], None], log: str | os.PathLike[str]) -> int:
 def limit_memory() -> None:
     """Lets allocations fail beyond the bound, so that asking for more is a finding."""
     pages = int(pathlib.Path("/proc/self/statm").read_text().split()[0])
-    resource.setrlimit(resource.RLIMIT_AS, (pages * os.sysconf("SC_PAGE_SIZE") + MEMORY_BYTES,) * 2)
+    bound = pages * resource.getpagesize() + MEMORY_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (bound, bound))
 
 
 def fuzz(target: Target, folder: pathlib.Path, seconds: int, counter: Counter) -> None:
@@ -144,32 +145,42 @@ def fuzz_reader(name: str, seconds: float, folder: pathlib.Path) -> dict[str, An
     target = TARGETS[name]
     folder.mkdir(parents=True, exist_ok=True)
     log, counter = folder / "log.txt", Counter(folder / "executions")
-    start = time.monotonic()
+    start, cpu_start = time.monotonic(), children_cpu_s()
     while (left := seconds - (time.monotonic() - start)) > _LEAST_S:
         in_child(lambda left=left: fuzz(target, folder, int(left), counter), log)
     # libFuzzer measures hangs by the clock, so a process that was paused looks like one.
+    spent = {
+        "minutes": (time.monotonic() - start) / 60,
+        "cpu_minutes": (children_cpu_s() - cpu_start) / 60,
+        "executions": counter.value,
+    }
     files = [path for path in sorted((folder / "findings").iterdir()) if path.suffix != ".txt"]
     findings = [path.name for path in files if in_child(lambda path=path: replay(target, path), log)]
     corpus = [path.stat().st_size for path in (folder / "corpus").iterdir()]
     return {
-        "minutes": (time.monotonic() - start) / 60,
-        "executions": counter.value,
+        **spent,
         "corpus_files": len(corpus),
         "corpus_bytes": sum(corpus),
         "findings": findings,
     }
 
 
+def children_cpu_s() -> float:
+    """What the children that have ended took of the processor, s."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
 def added(earlier: dict[str, Any] | None, report: dict[str, Any]) -> dict[str, Any]:
     """Minutes and executions of both; the rest of the later."""
     if earlier is None:
         return report
-    return report | {name: earlier[name] + report[name] for name in ("minutes", "executions")}
+    return report | {name: earlier[name] + report[name] for name in ("minutes", "cpu_minutes", "executions")}
 
 
 def main() -> None:
     """Fuzzes the readers one after the other; ends with 1 where there are findings."""
-    options = common.parser(__doc__.partition("\n")[0], preset=False)
+    options = common.parser("Fuzzing of every reader of jaxbox.io.", preset=False)
     options.add_argument("--reader", action="append", choices=list(TARGETS), help="only this; repeatable")
     options.add_argument("--minutes", type=float, default=MINUTES, help="for each reader")
     options.add_argument(

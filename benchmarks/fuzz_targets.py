@@ -1,4 +1,4 @@
-"""What the fuzzer reads: every reader of `jaxbox.io`, with small files that the formats' own libraries write."""
+"""What the fuzzer reads: every reader of `jaxbox.io`, with small files of the formats' own libraries."""
 
 import contextlib
 import dataclasses
@@ -14,10 +14,9 @@ import laspy
 import numpy as np
 import plyfile
 import pyarrow as pa
-import pyarrow.feather
-import pypcd4
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
+from pyarrow import feather
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
@@ -101,6 +100,7 @@ def write_text(folder: pathlib.Path) -> None:
 
 def write_pcd(folder: pathlib.Path) -> None:
     """The three encodings, with columns of several types."""
+    pypcd4 = importlib.import_module("pypcd4")
     for encoding in ("ascii", "binary", "binary_compressed"):
         types = (np.float32, np.float32, np.float64, np.float32, np.uint16)
         columns = [column.astype(kind) for column, kind in zip(np.abs(POINTS.T), types, strict=True)]
@@ -123,14 +123,14 @@ def write_las(folder: pathlib.Path, suffix: str) -> None:
         las = laspy.LasData(laspy.LasHeader(point_format=point_format, version=version))
         las.x, las.y, las.z = POINTS[:, :3].T.astype(float)
         las.intensity = np.arange(NUM_POINTS)
-        las.write(folder / f"{version}{suffix}")
+        las.write(str(folder / f"{version}{suffix}"))
 
 
 def write_npy(folder: pathlib.Path) -> None:
     """A matrix, one in Fortran's order, and records."""
     np.save(folder / "a.npy", POINTS)
     np.save(folder / "b.npy", np.asfortranarray(POINTS.astype(np.float64)))
-    np.save(folder / "c.npy", np.rec.fromarrays(POINTS.T, names=",".join(NAMES)))
+    np.save(folder / "c.npy", np.rec.fromarrays(POINTS.T, dtype=[(name, "f4") for name in NAMES]))
 
 
 def write_npz(folder: pathlib.Path) -> None:
@@ -145,14 +145,14 @@ def write_feather(folder: pathlib.Path) -> None:
     columns = {name: POINTS[:, index].astype(np.float16) for index, name in enumerate("xyz")}
     table = pa.table({**columns, "intensity": np.arange(NUM_POINTS, dtype=np.uint8)})
     for compression in ("uncompressed", "lz4", "zstd"):
-        pa.feather.write_feather(table, folder / f"{compression}.feather", compression=compression)
+        feather.write_feather(table, folder / f"{compression}.feather", compression=compression)
 
 
 def write_feather_calibration(folder: pathlib.Path) -> None:
     """Where the sensors are."""
     place = {"tx_m": [0.0, 1.25], "ty_m": [0.0, 0.5], "tz_m": [0.0, 2.0]}
     table = pa.table({"sensor_name": ["down_lidar", "up_lidar"], **place})
-    pa.feather.write_feather(table, folder / "a.feather", compression="uncompressed")
+    feather.write_feather(table, folder / "a.feather", compression="uncompressed")
 
 
 def read_calibrated_feather(path: pathlib.Path) -> None:

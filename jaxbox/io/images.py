@@ -44,7 +44,8 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
 def _claimed_size(data: bytes) -> tuple[int, int]:
     """Width and height, px, by the file's head; zeros where it is neither PNG nor JPEG."""
     if data.startswith(_PNG) and len(data) >= len(_PNG) + 8:
-        return struct.unpack_from(">II", data, len(_PNG))
+        width, height = struct.unpack_from(">II", data, len(_PNG))
+        return width, height
     place = len(_JPEG)
     while data.startswith(_JPEG) and place + 9 <= len(data) and data[place] == _MARKER:
         marker, length, height, width = struct.unpack_from(">xBHxHH", data, place)

@@ -67,7 +67,7 @@ def is_mcap_folder(path: pathlib.Path) -> bool:
 
 
 def _count_messages(reader: McapFile, others: set[str]) -> tuple[dict[str, int], int]:
-    """Messages by topic of points, and the first time, by the index or else by one pass; adds other topics."""
+    """Messages by topic of points, and the first time, by the index or else one pass; adds other topics."""
     counts: dict[str, int] = {}
     summary = reader.summary
     if summary is None or summary.statistics is None:

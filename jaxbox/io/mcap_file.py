@@ -57,7 +57,7 @@ class McapFile:
         self._library.read_magic(
             require("mcap.data_stream", extra="mcap", what="MCAP files").ReadDataStream(file)
         )
-        self.summary = self._read_summary()
+        self.summary: Any = self._read_summary()
         """The library's `Summary`, or None where the file has none."""
 
     def _stream(self, *, skip_magic: bool = True) -> Iterator[Any]:
@@ -97,10 +97,13 @@ class McapFile:
         Yields:
           Messages in the order of time, or, where the file has no index, in its own order.
         """
-        indexed = self.summary is not None and self.summary.chunk_indexes
-        schemas = dict(self.summary.schemas) if indexed else {}
-        channels = dict(self.summary.channels) if indexed else {}
-        for record in self._indexed_records(topic) if indexed else self._all_records():
+        schemas, channels = {}, {}
+        if self.summary is not None and self.summary.chunk_indexes:
+            schemas, channels = dict(self.summary.schemas), dict(self.summary.channels)
+            records = self._indexed_records(topic)
+        else:
+            records = self._all_records()
+        for record in records:
             if isinstance(record, self._records.Schema):
                 schemas[record.id] = record
             elif isinstance(record, self._records.Channel):

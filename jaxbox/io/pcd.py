@@ -53,7 +53,8 @@ def read_pcd(path: str | os.PathLike[str]) -> Points:
         if header.data.value == "ascii":
             return named_points(_read_ascii(file, header, str(path)), str(path))
         _check_body(file, header, size, str(path))
-        whole = io.BytesIO("\n".join([*lines, ""]).encode() + file.read())
+        # The header as it was understood and checked, so that pypcd4 cannot find another one in the file.
+        whole = io.BytesIO(header.compose_header().encode() + file.read())
         try:
             cloud = pypcd4.PointCloud.from_fileobj(whole).pc_data
         # For broken bytes the decompressor answers None, which pypcd4 takes the length of, or MemoryError.

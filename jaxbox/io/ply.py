@@ -43,7 +43,7 @@ def read_ply(path: str | os.PathLike[str]) -> Points:
         if order:
             size = count * dtype.itemsize
             check_num_bytes(size, there - file.tell(), str(path))
-            vertices = np.frombuffer(file.read(size), dtype)
+            vertices = np.frombuffer(file.read(size), dtype) if size else np.zeros(0, dtype)
         else:
             vertices = _read_ascii(file, count, dtype, str(path))
     return named_points({name: vertices[name] for name in dtype.names or ()}, str(path))

@@ -21,6 +21,7 @@ METADATA_NAME = "metadata.yaml"
 """What a folder of ROS 2 holds beside its storage."""
 
 _TYPE = MESSAGE_TYPES[0]
+_MAX_METADATA_BYTES = 2**24
 _PACKED_MESSAGES = "message"
 _MAX_PACKED_RATIO = 100
 _PIECE_BYTES = 2**20
@@ -47,7 +48,7 @@ def open_rosbag(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
     def messages() -> Iterator[Message]:
         with _reader(path) as reader:
             connections = [c for c in reader.connections if c.topic == chosen and c.msgtype == _TYPE]
-            is_packed = not _is_ros1(path) and reader.compression_mode == _PACKED_MESSAGES
+            is_packed = getattr(reader, "compression_mode", None) == _PACKED_MESSAGES
             for _, timestamp_ns, data in _raw_messages(reader, connections):
                 where = f"{path}, {chosen} at {timestamp_ns}"
                 message = unpack(data, "zstd", where) if is_packed else data
@@ -64,8 +65,7 @@ def _is_ros1(path: pathlib.Path) -> bool:
 def _reader(path: pathlib.Path) -> Iterator[Any]:
     """The bag, with whatever `rosbags` and its decoders raise on broken bytes as one kind of error."""
     module = require("rosbags.rosbag1" if _is_ros1(path) else "rosbags.rosbag2", extra="ros", what="ROS bags")
-    for file in path.iterdir() if path.is_dir() else (path,):
-        check_file(file, max_bytes=None)
+    _check_files(path)
     try:
         _check_packed_files(path)
         with module.Reader(path) as reader:
@@ -81,6 +81,12 @@ def _reader(path: pathlib.Path) -> Iterator[Any]:
         ) from error
 
 
+def _check_files(path: pathlib.Path) -> None:
+    """Refuses pipes and devices; of a folder, whatever its metadata may name."""
+    for file in [file for file in path.iterdir() if not file.is_dir()] if path.is_dir() else [path]:
+        check_file(file, max_bytes=_MAX_METADATA_BYTES if file.name == METADATA_NAME else None)
+
+
 def _bound_chunks(reader: Any, where: str) -> None:
     """Lets chunks of ROS 1 be unpacked with a bound in place of the library's own functions."""
     known = require("rosbags.rosbag1.reader", extra="ros", what="ROS bags").decompressors
@@ -92,9 +98,8 @@ def _bound_chunks(reader: Any, where: str) -> None:
 
 def _raw_messages(reader: Any, connections: Any) -> Iterator[Any]:
     """Messages of a bag, as they are stored: the library would unpack those of ROS 2 without a bound."""
-    storage = getattr(reader, "storage", None)
-    if getattr(storage, "metadata", None) is not None and reader.compression_mode == _PACKED_MESSAGES:
-        storage.metadata = storage.metadata._replace(compression_mode=None)
+    if getattr(reader, "compression_mode", None) == _PACKED_MESSAGES:
+        reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
     return reader.messages(connections)
 
 

@@ -47,7 +47,12 @@ class Sweep:
         Raises:
           InputError: for a name that would lead out of the folder of the results.
         """
-        if "\0" in self.name or self.name != pathlib.PurePath(self.name).name or self.name == "..":
+        if (
+            not self.name
+            or "\0" in self.name
+            or self.name != pathlib.PurePath(self.name).name
+            or self.name == ".."
+        ):
             raise InputError(
                 f"{self.points_path}: its sweep would be named {self.name!r}, and results are named by it; "
                 "rename the file, or give a name without folders."
