@@ -47,12 +47,8 @@ class Sweep:
         Raises:
           InputError: for a name that would lead out of the folder of the results.
         """
-        if (
-            not self.name
-            or "\0" in self.name
-            or self.name != pathlib.PurePath(self.name).name
-            or self.name == ".."
-        ):
+        is_plain = self.name not in ("", "..") and pathlib.PurePath(self.name).name == self.name
+        if not is_plain or "\0" in self.name:
             raise InputError(
                 f"{self.points_path}: its sweep would be named {self.name!r}, and results are named by it; "
                 "rename the file, or give a name without folders."
