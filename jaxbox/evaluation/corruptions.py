@@ -1,0 +1,323 @@
+"""Sweeps made worse on purpose: lost beams, noise, fog, spurious returns, motion, a calibration that is off.
+
+Each function takes one sweep and how much of a thing happens to it; at the amount given as "none" it changes
+nothing. They answer "how does the answer fall off", not "how will it be in rain": real weather has more to it
+than the models below. Points keep their order, and none is added, so that a corrupted sweep has at most the
+points of the clean one.
+
+References: Dong et al., "Benchmarking Robustness of 3D Object Detection to Common Corruptions", CVPR 2023
+(kinds, and the scale of noise); Hahner et al., "Fog Simulation on Real LiDAR Point Clouds for 3D Object
+Detection in Adverse Weather", ICCV 2021 (the LiDAR equation in fog).
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+Points = tuple[np.ndarray, np.ndarray]
+"""(n, 3) float32, m, sensor frame; (n,) float32, the sensor's own unit."""
+
+BEAM_WRAP_RAD = 1.0
+"""A fall of the azimuth by more than this from one point to the next begins the next beam."""
+
+REACH_M = 120.0
+"""Range to which a surface that reflects everything is seen in clear air (HDL-64E: 120 m for a car)."""
+
+BACKSCATTER_SHARE = 0.3
+"""Of the beams that fog takes, the share that come back from the fog itself."""
+
+MIN_RANGE_M = 2.0
+"""No spurious return is nearer: an HDL-64E reports none nearer than 0.9 m, and the carrier is left out."""
+
+SWEEP_PERIOD_S = 0.1
+"""Of one turn."""
+
+
+def beam_numbers(xyz: np.ndarray) -> np.ndarray:
+    """Numbers the beams of a sweep whose points come beam by beam, as KITTI's do.
+
+    Within a beam the azimuth grows from +x; where it falls back, the next beam begins.
+
+    Args:
+      xyz: (n, 3) m, sensor frame.
+
+    Returns:
+      (n,) int, from 0.
+
+    >>> beam_numbers(np.array([[1, 0.1, 0], [-1, 0.1, 0], [1, -0.1, 0], [1, 0.2, -1]])).tolist()
+    [0, 0, 0, 1]
+    """
+    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]) % math.tau
+    return np.cumsum(np.diff(azimuth, prepend=azimuth[:1]) < -BEAM_WRAP_RAD)
+
+
+def thin_beams(xyz: np.ndarray, intensity: np.ndarray, one_in: float, rng: np.random.Generator) -> Points:
+    """Keeps every so many-th beam, as a sensor with fewer beams over the same angles would have them.
+
+    Args:
+      xyz: (n, 3) m, beam by beam, see `beam_numbers`.
+      intensity: (n,).
+      one_in: 1 keeps all (none lost), 2 every second, ...
+      rng: not used, every run is the same.
+
+    Returns:
+      The points of the beams kept: the last of each `one_in`, so that of 64 beams from the top the lowest,
+      which shows the ground near by, is among them.
+    """
+    beam = beam_numbers(xyz)
+    keep = beam % int(one_in) == int(one_in) - 1
+    return xyz[keep], intensity[keep]
+
+
+def lose_points(xyz: np.ndarray, intensity: np.ndarray, share: float, rng: np.random.Generator) -> Points:
+    """Loses points at random, each with the same probability.
+
+    Args:
+      xyz: (n, 3) m.
+      intensity: (n,).
+      share: probability, 0 (none) to 1.
+      rng: draws them.
+
+    Returns:
+      The points left.
+    """
+    keep = rng.random(len(xyz)) >= share
+    return xyz[keep], intensity[keep]
+
+
+def add_range_noise(xyz: np.ndarray, intensity: np.ndarray, std_m: float, rng: np.random.Generator) -> Points:
+    """Moves each point along its beam by Gaussian noise.
+
+    Args:
+      xyz: (n, 3) m.
+      intensity: (n,).
+      std_m: standard deviation, m; 0 is none. Dong et al. go up to 0.1.
+      rng: draws the noise.
+
+    Returns:
+      As many points.
+    """
+    distance = np.maximum(np.linalg.norm(xyz, axis=1), np.finfo(np.float32).tiny)
+    scale = 1 + rng.normal(0, 1, len(xyz)) * std_m / distance
+    return (xyz * np.maximum(scale, 0)[:, None]).astype(np.float32), intensity
+
+
+def add_fog(xyz: np.ndarray, intensity: np.ndarray, visibility_m: float, rng: np.random.Generator) -> Points:
+    """Weakens returns by fog, loses the too weak, and lets some of those come back from the fog.
+
+    A return from R has the power rho / R^2 exp(-2 alpha R), with alpha = ln(20) / visibility (Koschmieder;
+    Hahner et al.), and is seen where that is at least 1 / REACH_M^2. What was seen in clear air had a
+    reflectivity of at least (R / REACH_M)^2; it is taken as uniform from there to 1, since some recordings
+    have no intensity. Beams that return from fog do so at a range of density exp(-2 alpha r).
+
+    Args:
+      xyz: (n, 3) m.
+      intensity: (n,).
+      visibility_m: meteorological optical range, m; infinity is none.
+      rng: draws which beams are lost, and where from fog returns.
+
+    Returns:
+      The points left, with intensities weakened; those from the fog have intensity 0.
+    """
+    alpha = math.log(20) / visibility_m
+    distance = np.linalg.norm(xyz, axis=1).astype(np.float64)
+    least = np.minimum((distance / REACH_M) ** 2, 1)
+    reflectivity = least + (1 - least) * rng.random(len(xyz))
+    seen = reflectivity * np.exp(-2 * alpha * distance) >= least
+    scattered = ~seen & (rng.random(len(xyz)) < BACKSCATTER_SHARE) & (distance > MIN_RANGE_M)
+    near = _truncated_exponential(rng.random(len(xyz)), 2 * alpha, MIN_RANGE_M, distance)
+    scale = np.where(scattered, near / np.maximum(distance, MIN_RANGE_M), 1)
+    weaker = np.where(scattered, 0, intensity * np.exp(-2 * alpha * distance))
+    keep = seen | scattered
+    return (xyz * scale[:, None]).astype(np.float32)[keep], weaker.astype(np.float32)[keep]
+
+
+def _truncated_exponential(share: np.ndarray, rate: float, low: float, high: np.ndarray) -> np.ndarray:
+    """Quantiles of the density exp(-rate r) over low to high; uniform where the rate is 0."""
+    width = np.maximum(high - low, 0)
+    if rate == 0:
+        return low + share * width
+    return low - np.log1p(share * np.expm1(-rate * width)) / rate
+
+
+def add_clutter(xyz: np.ndarray, intensity: np.ndarray, share: float, rng: np.random.Generator) -> Points:
+    """Ends beams early at random, as drops, flakes and crosstalk do.
+
+    Args:
+      xyz: (n, 3) m.
+      intensity: (n,).
+      share: probability of each beam, 0 (none) to 1.
+      rng: draws which, and where: uniform from `MIN_RANGE_M` to the return.
+
+    Returns:
+      As many points; spurious ones have intensity 0.
+    """
+    distance = np.linalg.norm(xyz, axis=1)
+    spurious = (rng.random(len(xyz)) < share) & (distance > MIN_RANGE_M)
+    near = MIN_RANGE_M + rng.random(len(xyz)) * (distance - MIN_RANGE_M)
+    scale = np.where(spurious, near / np.maximum(distance, MIN_RANGE_M), 1)
+    return (xyz * scale[:, None]).astype(np.float32), np.where(spurious, 0, intensity).astype(np.float32)
+
+
+def drive_during_sweep(
+    xyz: np.ndarray, intensity: np.ndarray, speed_m_s: float, rng: np.random.Generator
+) -> Points:
+    """Distorts a sweep as if the sensor drove straight on while it turned, and nobody undid it.
+
+    A point at azimuth phi is seen phi / 2 pi of a period after the sensor looked straight ahead, and then is
+    nearer by the way gone. The distortion comes on top of what the recording has.
+
+    Args:
+      xyz: (n, 3) m.
+      intensity: (n,).
+      speed_m_s: m/s along x; 0 is none.
+      rng: not used.
+
+    Returns:
+      As many points.
+    """
+    shift = np.zeros_like(xyz)
+    shift[:, 0] = speed_m_s * _firing_time(xyz)
+    return (xyz - shift).astype(np.float32), intensity
+
+
+def turn_during_sweep(
+    xyz: np.ndarray, intensity: np.ndarray, rate_deg_s: float, rng: np.random.Generator
+) -> Points:
+    """Distorts a sweep as if the sensor's carrier turned meanwhile, see `drive_during_sweep`.
+
+    Args:
+      xyz: (n, 3) m.
+      intensity: (n,).
+      rate_deg_s: degrees a second, to the left; 0 is none.
+      rng: not used.
+
+    Returns:
+      As many points.
+    """
+    angle = -np.radians(rate_deg_s) * _firing_time(xyz)
+    cos, sin, (x, y, z) = np.cos(angle), np.sin(angle), xyz.T
+    return np.column_stack([cos * x - sin * y, sin * x + cos * y, z]).astype(np.float32), intensity
+
+
+def _firing_time(xyz: np.ndarray) -> np.ndarray:
+    """(n,) s, from -half a period to half a period; 0 straight ahead."""
+    return SWEEP_PERIOD_S / math.tau * np.arctan2(xyz[:, 1], xyz[:, 0])
+
+
+def rotate_calibration(T_rect_velo: np.ndarray, angle_deg: float, rng: np.random.Generator) -> np.ndarray:
+    """A LiDAR-to-camera transform that is turned about a random axis through the LiDAR.
+
+    Args:
+      T_rect_velo: (4, 4) rigid transform.
+      angle_deg: degrees; 0 is none.
+      rng: draws the axis, uniform on the sphere.
+
+    Returns:
+      (4, 4) float32.
+    """
+    axis = rng.normal(size=3)
+    x, y, z = axis / np.linalg.norm(axis)
+    # Rodrigues' formula.
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = math.radians(angle_deg)
+    T_error = np.eye(4)
+    T_error[:3, :3] += math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+    return (np.asarray(T_rect_velo, np.float64) @ T_error).astype(np.float32)
+
+
+def shift_calibration(T_rect_velo: np.ndarray, distance_m: float, rng: np.random.Generator) -> np.ndarray:
+    """A LiDAR-to-camera transform that is moved in a random direction.
+
+    Args:
+      T_rect_velo: (4, 4) rigid transform.
+      distance_m: m; 0 is none.
+      rng: draws the direction, uniform on the sphere.
+
+    Returns:
+      (4, 4) float32.
+    """
+    direction = rng.normal(size=3)
+    T_error = np.eye(4)
+    T_error[:3, 3] = distance_m * direction / np.linalg.norm(direction)
+    return (np.asarray(T_rect_velo, np.float64) @ T_error).astype(np.float32)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Corruption:
+    """One kind of corruption at five severities."""
+
+    title: str
+    """What happens, in words."""
+    unit: str
+    """Of the amounts."""
+    none: float
+    """The amount that changes nothing."""
+    amounts: tuple[float, ...]
+    """Of severity 1 to 5."""
+    of_points: Callable[[np.ndarray, np.ndarray, float, np.random.Generator], Points] | None = None
+    """Corrupts the points; None where the calibration is."""
+    of_calibration: Callable[[np.ndarray, float, np.random.Generator], np.ndarray] | None = None
+    """Corrupts T_rect_velo; None where the points are."""
+
+
+CORRUPTIONS: dict[str, Corruption] = {
+    "beams": Corruption(
+        title="beam loss", unit="one beam kept in", none=1, amounts=(2, 3, 4, 8, 16), of_points=thin_beams
+    ),
+    "dropout": Corruption(
+        title="lost points",
+        unit="share lost",
+        none=0,
+        amounts=(0.25, 0.5, 0.75, 0.9, 0.95),
+        of_points=lose_points,
+    ),
+    "noise": Corruption(
+        title="range noise",
+        unit="m, standard deviation",
+        none=0,
+        amounts=(0.02, 0.05, 0.1, 0.2, 0.4),
+        of_points=add_range_noise,
+    ),
+    "fog": Corruption(
+        title="fog", unit="m visibility", none=math.inf, amounts=(400, 200, 100, 50, 25), of_points=add_fog
+    ),
+    "clutter": Corruption(
+        title="spurious returns",
+        unit="share of beams",
+        none=0,
+        amounts=(0.01, 0.02, 0.05, 0.1, 0.2),
+        of_points=add_clutter,
+    ),
+    "speed": Corruption(
+        title="driving during the sweep",
+        unit="m/s",
+        none=0,
+        amounts=(5, 10, 15, 20, 30),
+        of_points=drive_during_sweep,
+    ),
+    "turning": Corruption(
+        title="turning during the sweep",
+        unit="degrees/s",
+        none=0,
+        amounts=(5, 10, 20, 40, 80),
+        of_points=turn_during_sweep,
+    ),
+    "calibration_angle": Corruption(
+        title="calibration turned",
+        unit="degrees",
+        none=0,
+        amounts=(0.25, 0.5, 1, 2, 4),
+        of_calibration=rotate_calibration,
+    ),
+    "calibration_shift": Corruption(
+        title="calibration moved",
+        unit="m",
+        none=0,
+        amounts=(0.02, 0.05, 0.1, 0.2, 0.4),
+        of_calibration=shift_calibration,
+    ),
+}
+"""Those that `benchmarks.bench_corruption` measures."""
