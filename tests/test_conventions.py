@@ -24,6 +24,7 @@ FOUNDATION = {
     "config",
     "padding",
     "settings",
+    "summary",
     "masked",
     "grouping",
     "geometry",

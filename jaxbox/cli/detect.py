@@ -194,7 +194,9 @@ def _process(
     start = time.perf_counter()
     record = results.write(sweep, detections, calibration=calibration, points=(xyz, intensity), image=image)
     if options.json:
-        _print_json({**record, "num_points": len(xyz), "detect_ms": round(detect_s * 1e3, 3)})
+        health = detections.summary(options.config).to_dict()
+        timing = {"num_points": len(xyz), "detect_ms": round(detect_s * 1e3, 3)}
+        _print_json({**record, **timing, "health": health})
     if options.pictures:
         _write_pictures(sweep, cloud, detections, calibration, options)
     return FrameReport(
