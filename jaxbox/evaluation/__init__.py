@@ -1,5 +1,6 @@
 """How good are the boxes: KITTI's protocol, overlaps, recall and precision, and the errors of size."""
 
+from jaxbox.evaluation.beams import beam_of_points, thin_beams
 from jaxbox.evaluation.iou import paired_overlaps, pairwise_overlaps
 from jaxbox.evaluation.kitti import KittiEvaluation, PrecisionCurve, evaluate, soft_score
 from jaxbox.evaluation.matching import Selection, count_points_in_boxes
@@ -11,6 +12,7 @@ __all__ = [
     "KittiEvaluation",
     "PrecisionCurve",
     "Selection",
+    "beam_of_points",
     "constant_sizes",
     "count_points_in_boxes",
     "evaluate",
@@ -20,5 +22,6 @@ __all__ = [
     "pairwise_overlaps",
     "size_errors",
     "soft_score",
+    "thin_beams",
     "yaw_errors",
 ]
