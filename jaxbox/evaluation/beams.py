@@ -33,7 +33,7 @@ def beam_of_points(xyz: np.ndarray) -> np.ndarray:
     finite = np.isfinite(xyz).all(axis=1)
     azimuth = np.arctan2(xyz[finite, 1].astype(np.float64), xyz[finite, 0]) % (2 * np.pi)
     step = np.diff(azimuth, prepend=azimuth[:1])
-    direction = np.sign(np.median(step)) or 1.0
+    direction = -1.0 if np.sum(step > 0) < np.sum(step < 0) else 1.0
     # Back by a turn is a new beam; forth again by a turn was no new beam after all.
     turns = np.cumsum((direction * step < -_MIN_BACK_RAD).astype(int) - (direction * step > _MIN_BACK_RAD))
     beam = np.zeros(len(xyz), int)
@@ -70,7 +70,7 @@ def thin_beams(xyz: np.ndarray, *, num_beams: int, keep_every: int, first: int =
     # A beam without a return leaves no trace; a first or last point beyond the cut is a beam more.
     if len(xyz) and abs(found - num_beams) > max(1, _MAX_MISSING * num_beams):
         raise ValueError(
-            f"the azimuth turns {found} times, where a sensor of {num_beams} beams turns so often: the points "
-            "are not in the order of beams. Take the sensor's own files, before they are sorted or moved."
+            f"the azimuth turns {found} times and the sensor has {num_beams} beams: the points are not in the "
+            "order of beams. Take the sensor's own files, before they are sorted or moved."
         )
     return beam % keep_every == first
