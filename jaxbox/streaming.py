@@ -1,15 +1,10 @@
 """stream(): recorded sweeps through the detector, the next one read while one is computed."""
 
-import collections
 import concurrent.futures
 import dataclasses
 import itertools
-import multiprocessing
-import os
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +15,10 @@ from jaxbox.detector import detect
 from jaxbox.padding import aligned_zeros, checked_points, fill_rows, fitting_capacity
 from jaxbox.steps import check_settings
 from jaxbox.types import Detections, PointCloud
+from jaxbox.workers import ProcessPool, WorkerDied, ahead
 
 NUM_BUFFERS = 3
 """One sweep is computed, one has been read, and one is being read."""
-
-THREADS_VARIABLE = "NPROC"
-"""Environment variable by which XLA is told how many threads a process may take."""
 
 
 class ReadableSweep(Protocol):
@@ -81,7 +74,8 @@ def stream(
 
     Yields:
       The result of each sweep, in their order, with the same bits as `detect` gives. One that cannot be
-      read, or that ends its process, comes with an error, and the others go on.
+      read comes with an error, and the others go on. One whose process dies is tried in a new process, and
+      comes with an error where that dies too.
 
     Raises:
       ValueError: for settings that contradict each other or workers below 1.
@@ -92,19 +86,7 @@ def stream(
     check_settings(config)
     if workers == 1:
         return _stream_here(sweeps, config, key, capacity)
-    return _stream_apart(sweeps, _Settings.pack(config, key, capacity, workers), workers)
-
-
-def _ahead(
-    sweeps: Iterable[Any], submit: Callable[[Any], Future[Any]], count: int
-) -> Iterator[tuple[Any, Future[Any]]]:
-    """Each sweep and its future, in order; the next `count` are submitted before it is handed out."""
-    waiting = collections.deque()
-    for sweep in sweeps:
-        waiting.append((sweep, submit(sweep)))
-        if len(waiting) > count:
-            yield waiting.popleft()
-    yield from waiting
+    return _stream_apart(sweeps, _Settings.pack(config, key, capacity), workers)
 
 
 class _Buffer:
@@ -152,16 +134,12 @@ def _stream_here(
     sweeps: Iterable[ReadableSweep], config: DetectorConfig, key: jax.Array | None, capacity: int | None
 ) -> Iterator[StreamedSweep]:
     buffers = itertools.cycle([_Buffer() for _ in range(NUM_BUFFERS)])
-    computing: StreamedSweep | None = None
     with concurrent.futures.ThreadPoolExecutor(1) as reader:
-        for sweep, reading in _ahead(sweeps, lambda s: reader.submit(_read, s, next(buffers), capacity), 1):
-            started = _start(sweep.name, reading.result(), config, key)
-            # The device is busy with this one while the caller looks at the one before.
-            if computing is not None:
-                yield _finish(computing)
-            computing = started
-    if computing is not None:
-        yield _finish(computing)
+        read = ahead(sweeps, lambda sweep: reader.submit(_read, sweep, next(buffers), capacity), 1)
+        # The device is busy with the next one while the caller looks at this.
+        started = ahead(read, lambda pair: _start(pair[0].name, pair[1].result(), config, key), 1)
+        for _, computing in started:
+            yield _finish(computing)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -172,83 +150,32 @@ class _Settings:
     key_data: np.ndarray | None
     key_impl: str | None
     capacity: int | None
-    num_threads: int
-    cache_folder: str | None
 
     @classmethod
-    def pack(
-        cls, config: DetectorConfig, key: jax.Array | None, capacity: int | None, workers: int
-    ) -> "_Settings":
+    def pack(cls, config: DetectorConfig, key: jax.Array | None, capacity: int | None) -> "_Settings":
         return cls(
             config=jax.tree.map(float, config),
             key_data=None if key is None else np.asarray(jax.random.key_data(key)),
             key_impl=None if key is None else str(jax.random.key_impl(key)),
             capacity=capacity,
-            num_threads=max(1, (os.cpu_count() or 1) // workers),
-            cache_folder=jax.config.values["jax_compilation_cache_dir"],
         )
 
-    def unpack_key(self) -> jax.Array | None:
-        return (
-            None
-            if self.key_data is None
-            else jax.random.wrap_key_data(jnp.asarray(self.key_data), impl=self.key_impl)
+    def start(self) -> Callable[[ReadableSweep], StreamedSweep]:
+        """In a worker process: what takes each sweep."""
+        buffer, key = _Buffer(), None
+        if self.key_data is not None:
+            key = jax.random.wrap_key_data(jnp.asarray(self.key_data), impl=self.key_impl)
+        return lambda sweep: _finish(
+            _start(sweep.name, _read(sweep, buffer, self.capacity), self.config, key)
         )
-
-
-_worker: tuple[_Settings, jax.Array | None, _Buffer] | None = None
-"""In a worker process: what it works with."""
-
-
-def _set_up_worker(settings: _Settings) -> None:
-    global _worker  # noqa: PLW0603 - a process pool has no other place for what its tasks share
-    os.environ.setdefault(THREADS_VARIABLE, str(settings.num_threads))
-    jax.config.update("jax_compilation_cache_dir", settings.cache_folder)
-    _worker = (settings, settings.unpack_key(), _Buffer())
-
-
-def _detect_one(sweep: ReadableSweep) -> StreamedSweep:
-    assert _worker is not None, "the pool sets its workers up"
-    settings, key, buffer = _worker
-    return _finish(_start(sweep.name, _read(sweep, buffer, settings.capacity), settings.config, key))
-
-
-def _new_pool(workers: int, settings: _Settings) -> concurrent.futures.ProcessPoolExecutor:
-    # A fork would copy JAX's threads half-way through their work.
-    start = multiprocessing.get_context("spawn")
-    return concurrent.futures.ProcessPoolExecutor(workers, start, _set_up_worker, (settings,))
 
 
 def _stream_apart(
     sweeps: Iterable[ReadableSweep], settings: _Settings, workers: int
 ) -> Iterator[StreamedSweep]:
-    pool = _new_pool(workers, settings)
-
-    def submit(sweep: ReadableSweep) -> Future[StreamedSweep]:
-        nonlocal pool
-        try:
-            return pool.submit(_detect_one, sweep)
-        except BrokenProcessPool:
-            pool = _new_pool(workers, settings)
-            return pool.submit(_detect_one, sweep)
-
-    try:
-        for sweep, job in _ahead(sweeps, submit, 2 * workers):
+    with ProcessPool(settings.start, workers) as pool:
+        for sweep, job in ahead(sweeps, pool.submit, 2 * workers):
             try:
                 yield job.result()
-            except BrokenProcessPool:
-                # Some sweep that was in work has ended its process, and all the others with it.
-                yield _detect_alone(sweep, settings)
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _detect_alone(sweep: ReadableSweep, settings: _Settings) -> StreamedSweep:
-    """Detects in a process for this sweep only, which tells whether it was the one that ended its process."""
-    with _new_pool(1, settings) as pool:
-        try:
-            return pool.submit(_detect_one, sweep).result()
-        except BrokenProcessPool as error:
-            return StreamedSweep(
-                sweep.name, 0, None, f"its process ended, perhaps for want of memory: {error}"
-            )
+            except WorkerDied as died:
+                yield StreamedSweep(sweep.name, 0, None, str(died))

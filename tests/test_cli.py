@@ -405,7 +405,7 @@ def test_every_status_bit_is_described_for_a_sweep_and_counted_for_a_run(kitti_f
     frame = FrameReport(name="a", num_points=0, detections=detections, detect_s=0.1, other_s=0.1)
     lines = describe_frame(frame)
     assert len(lines) == 1 + len([bit for bit in Status if bit])
-    summary = "\n".join(describe_run(RunReport(frames=[FrameOutcome.of(frame)], failures=[("b", "why")]), {}))
+    summary = "\n".join(describe_run(RunReport(frames=[FrameOutcome.of(frame)], failures=[("b", "why")])))
     assert all(f"{bit.name} in 1 of 1 sweeps" in summary for bit in Status if bit)
     assert "failed: b: why" in summary
 

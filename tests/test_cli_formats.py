@@ -101,7 +101,9 @@ def test_json_for_scripts_is_one_object_a_sweep_and_a_summary(written):
     *lines, summary = [json.loads(line) for line in result.stdout.splitlines()]
     assert [line["boxes"] for line in lines] == [record["boxes"] for record in records_of(output)]
     assert all(line["detect_ms"] > 0 for line in lines)
-    assert summary == {"summary": {"done": 3, "skipped": 0, "interrupted": False, "failures": []}}
+    assert summary == {
+        "summary": {"done": 3, "skipped": 0, "interrupted": False, "failures": [], "repeated": []}
+    }
 
 
 def test_the_exact_settings_and_versions_are_beside_the_results_and_make_them_again(sweeps, tmp_path):
@@ -154,7 +156,8 @@ def test_interrupted_the_files_are_whole_and_the_rest_can_be_resumed(
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def interrupted(self):
-        if self.name == "b":
+        # It is read while "b" is computed, which may or may not be written by the time of the signal.
+        if self.name == "c":
             os.kill(os.getpid(), number)
         return read(self)
 
@@ -164,8 +167,9 @@ def test_interrupted_the_files_are_whole_and_the_rest_can_be_resumed(
     signal.signal(signal.SIGINT, before)
     assert result.exit_code == 1
     assert "--resume goes on" in result.stderr
-    assert [record["name"] for record in records_of(tmp_path)] == ["a"]
-    assert parquet.finished_parquet(tmp_path / FILES[2]) == {"a"}
+    done = [record["name"] for record in records_of(tmp_path)]
+    assert done in (["a"], ["a", "b"])
+    assert parquet.finished_parquet(tmp_path / FILES[2]) == set(done)
     assert json.loads((tmp_path / "run.json").read_text())["interrupted"]
     assert detect(tmp_path, *paths, *ONE_FILE, "--resume").exit_code == 0
     assert records_of(tmp_path) == records_of(written[0])

@@ -25,6 +25,7 @@ FOUNDATION = {
     "padding",
     "settings",
     "summary",
+    "versions",
     "masked",
     "grouping",
     "geometry",
@@ -34,12 +35,12 @@ STAGES = {
     "projection",
 }  # fmt: skip
 WIRING = {"steps", "detector"}
-MANY = {"batching", "streaming"}
+MANY = {"batching", "streaming", "workers"}
 TOOLS = {"io", "evaluation", "viz"}
 ALLOWED = {
     **dict.fromkeys(STAGES, FOUNDATION),
     **dict.fromkeys(WIRING, FOUNDATION | STAGES | WIRING),
-    **dict.fromkeys(MANY, FOUNDATION | WIRING),
+    **dict.fromkeys(MANY, FOUNDATION | WIRING | {"workers"}),
     "reference": {"version", "types", "class_priors", "config", "masked"},
     "synthetic": FOUNDATION | {"projection"},
     **dict.fromkeys(TOOLS, FOUNDATION | STAGES | WIRING | TOOLS),

@@ -57,6 +57,8 @@ jaxbox detect 'clouds/*.pcd' --output out --format parquet --format jsonl --no-p
 
 jaxbox detect drive.mcap --output out --format parquet --resume
 
+jaxbox detect 'drives/**/*.bin' --output out --no-pictures --jobs 8
+
 jaxbox detect sweep.pcd --output out --config my.toml --set vehicles.min_score=0.1 --json
 
 """
@@ -146,6 +148,9 @@ def detect(
     ] = 0.0,
     points: Annotated[bool, typer.Option(help="Put the points into MCAP and rerun files too.")] = True,
     pictures: Annotated[bool, typer.Option(help="Draw pictures of each sweep.")] = True,
+    jobs: Annotated[
+        int, typer.Option(min=1, help="Processes that read, detect and draw; results do not depend on it.")
+    ] = 1,
     resume: Annotated[
         bool, typer.Option("--resume", help="Pass over sweeps whose results in OUTPUT are complete.")
     ] = False,
@@ -171,6 +176,7 @@ def detect(
             min_score=min_score,
             points=points,
             pictures=pictures,
+            jobs=jobs,
             resume=resume,
             quiet=quiet,
             json=json,

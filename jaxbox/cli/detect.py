@@ -4,13 +4,13 @@ import dataclasses
 import json
 import pathlib
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
-import jax
-import numpy as np
+from rich.progress import Progress
 
 from jaxbox import io
 from jaxbox.cli.console import ExitCode, make_progress, print_error, stderr, stdout, stoppable
+from jaxbox.cli.frames import Frame, FrameSource, FrameWork
 from jaxbox.cli.report import (
     SHOWN_MIN_SCORE,
     FrameOutcome,
@@ -20,22 +20,11 @@ from jaxbox.cli.report import (
     describe_run,
 )
 from jaxbox.cli.results import ResultFormat, Results, RunAccount
-from jaxbox.cli.timing import TimedDetector
 from jaxbox.config import DetectorConfig
-from jaxbox.evaluation.iou import image_fractions
 from jaxbox.io.jsonl import JSONL
-from jaxbox.projection import project_boxes
-from jaxbox.types import Calibration, Detections, PointCloud
-from jaxbox.viz import BoxSet, draw_stages, save_png
+from jaxbox.workers import WorkerDied
 
 PICTURE_FOLDER = "pictures"
-SHOWN_PICTURES = ("boxes", "lidar", "image")
-"""Of the pictures of the stages, those that show the answer."""
-VEHICLE_TYPES = ("Car", "Van", "Truck")
-DONT_CARE_SHARE = 0.5
-"""A box with a larger share of its 2D box in one DontCare region is not judged."""
-
-_project_boxes = jax.jit(project_boxes)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -64,6 +53,13 @@ class DetectOptions:
     """Whether only errors are printed."""
     json: bool
     """Whether stdout is JSON Lines."""
+    jobs: int = 1
+    """Processes that read, detect and draw."""
+
+    @property
+    def shown_min_score(self) -> float:
+        """Boxes that score less are neither drawn nor counted."""
+        return max(SHOWN_MIN_SCORE, self.min_score)
 
     @property
     def speaks(self) -> bool:
@@ -96,8 +92,8 @@ def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
     )
     if options.resume:
         account.check_resumable()
-    detector = TimedDetector(options.config)
-    run = RunReport()
+    run = RunReport(jobs=options.jobs)
+    start = time.perf_counter()
     with Results(
         options.output,
         options.formats,
@@ -106,41 +102,77 @@ def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
         points=options.points,
     ) as results:
         account.write(finished=False)
-        _run_sweeps(sweeps, detector, options, run, results)
+        _run_sweeps(sweeps, options, run, results)
+    run.elapsed_s = time.perf_counter() - start
     account.write(
         finished=not (run.interrupted or run.failures),
         interrupted=run.interrupted,
         num_done=len(run.frames),
         num_skipped=run.num_skipped,
-        failures=[{"sweep": name, "reason": reason} for name, reason in run.failures],
+        failures=_as_json(run.failures),
+        repeated=_as_json(run.repeated),
     )
-    _report(run, results, detector, options)
+    _report(run, results, options)
     return ExitCode.FRAME_FAILED if run.failures or run.interrupted else ExitCode.OK
 
 
-def _run_sweeps(
-    sweeps: Sequence[io.Sweep],
-    detector: TimedDetector,
-    options: DetectOptions,
-    run: RunReport,
-    results: Results,
-) -> None:
+def _as_json(reasons: list[tuple[str, str]]) -> list[dict[str, str]]:
+    return [{"sweep": name, "reason": reason} for name, reason in reasons]
+
+
+def _run_sweeps(sweeps: Sequence[io.Sweep], options: DetectOptions, run: RunReport, results: Results) -> None:
     """Every sweep; ends early, with what is done, where it is interrupted or a recording breaks off."""
     with stoppable(), make_progress(shown=options.speaks) as progress:
+        task = progress.add_task("detecting", total=len(sweeps))
+        missing = _missing(sweeps, results, run, progress)
+        frames = _frames(missing, options, run, results)
         try:
-            for sweep in progress.track(sweeps, description="detecting"):
-                if results.is_finished(sweep.name):
-                    run.num_skipped += 1
-                else:
-                    _run_frame(sweep, detector, options, run, results)
+            for sweep, wait in frames:
+                _run_frame(sweep, wait, options, run, results)
+                progress.advance(task)
         except io.InputError as error:
             run.failures.append(("the recording", str(error)))
             print_error(str(error))
         except KeyboardInterrupt:
             run.interrupted = True
+        finally:
+            # Where it was interrupted, the workers end now, and not with the last reference to them.
+            frames.close()
 
 
-def _report(run: RunReport, results: Results, detector: TimedDetector, options: DetectOptions) -> None:
+def _missing(
+    sweeps: Sequence[io.Sweep], results: Results, run: RunReport, progress: Progress
+) -> Iterator[io.Sweep]:
+    """The sweeps that an earlier run has not finished."""
+    for sweep in sweeps:
+        if results.is_finished(sweep.name):
+            run.num_skipped += 1
+            progress.advance(progress.task_ids[0])
+        else:
+            yield sweep
+
+
+def _frames(
+    sweeps: Iterator[io.Sweep], options: DetectOptions, run: RunReport, results: Results
+) -> FrameSource:
+    """The frames of the sweeps, made here or by so many processes."""
+    work = FrameWork(
+        config=options.config,
+        capacity=options.capacity,
+        picture_folder=options.output / PICTURE_FOLDER if options.pictures else None,
+        shown_min_score=options.shown_min_score,
+        keep_points=results.wants_points,
+        keep_image=results.wants_image,
+    )
+
+    def on_death(sweep: io.Sweep, how: str) -> None:
+        run.repeated.append((sweep.name, how))
+        print_error(f"sweep {sweep.name}: its worker process ended ({how}); it is tried once more.")
+
+    return work.run(sweeps) if options.jobs == 1 else work.run_apart(sweeps, options.jobs, on_death)
+
+
+def _report(run: RunReport, results: Results, options: DetectOptions) -> None:
     """The end of the run, in sentences or as the last line of JSON."""
     if run.interrupted:
         stderr().print("interrupted; the same command with --resume goes on.", markup=False)
@@ -152,11 +184,11 @@ def _report(run: RunReport, results: Results, detector: TimedDetector, options: 
             markup=False,
         )
     if options.json:
-        failures = [{"sweep": name, "reason": reason} for name, reason in run.failures]
         counts = {"done": len(run.frames), "skipped": run.num_skipped, "interrupted": run.interrupted}
-        _print_json({"summary": {**counts, "failures": failures}})
+        lists = {"failures": _as_json(run.failures), "repeated": _as_json(run.repeated)}
+        _print_json({"summary": {**counts, **lists}})
     elif options.speaks:
-        for line in describe_run(run, detector.compile_s):
+        for line in describe_run(run):
             stdout().print(line, markup=False)
 
 
@@ -165,103 +197,48 @@ def _print_json(value: dict) -> None:
 
 
 def _run_frame(
-    sweep: io.Sweep, detector: TimedDetector, options: DetectOptions, run: RunReport, results: Results
+    sweep: io.Sweep,
+    wait: Callable[[], Frame],
+    options: DetectOptions,
+    run: RunReport,
+    results: Results,
 ) -> None:
     """One sweep, its files and its lines; a failure is added to the run."""
     try:
-        report = _process(sweep, detector, options, results)
-    except (io.InputError, OSError) as error:
+        report = _write(sweep, wait(), options, run, results)
+    except (io.InputError, OSError, WorkerDied) as error:
         run.failures.append((sweep.name, str(error)))
         print_error(f"sweep {sweep.name}: {error}")
         return
     run.frames.append(FrameOutcome.of(report))
     if options.speaks:
-        for line in describe_frame(report, min_score=max(SHOWN_MIN_SCORE, options.min_score)):
+        for line in describe_frame(report, min_score=options.shown_min_score):
             stdout().print(line, markup=False)
 
 
-def _process(
-    sweep: io.Sweep, detector: TimedDetector, options: DetectOptions, results: Results
+def _write(
+    sweep: io.Sweep, frame: Frame, options: DetectOptions, run: RunReport, results: Results
 ) -> FrameReport:
-    """Reads, detects, writes and draws; results are written before the pictures are tried."""
+    """Writes the results; that there are no pictures is said after that."""
     start = time.perf_counter()
-    xyz, intensity = sweep.read_points()
-    calibration = sweep.read_calibration()
-    image = sweep.read_image() if results.wants_image else None
-    cloud = PointCloud.from_numpy(xyz, intensity, capacity=options.capacity)
-    reading_s = time.perf_counter() - start
-    detections, detect_s = detector(cloud)
-    start = time.perf_counter()
-    record = results.write(sweep, detections, calibration=calibration, points=(xyz, intensity), image=image)
+    record = results.write(
+        sweep,
+        frame.detections,
+        calibration=frame.calibration,
+        points=frame.points,
+        image=frame.image,
+    )
     if options.json:
-        health = detections.summary(options.config).to_dict()
-        timing = {"num_points": len(xyz), "detect_ms": round(detect_s * 1e3, 3)}
+        health = frame.detections.summary(options.config).to_dict()
+        timing = {"num_points": frame.num_points, "detect_ms": round(frame.detect_s * 1e3, 3)}
         _print_json({**record, **timing, "health": health})
-    if options.pictures:
-        _write_pictures(sweep, cloud, detections, calibration, options)
+    run.add_compile_times(frame.compile_s)
+    if frame.picture_error is not None:
+        raise frame.picture_error
     return FrameReport(
         name=sweep.name,
-        num_points=len(xyz),
-        detections=detections,
-        detect_s=detect_s,
-        other_s=reading_s + time.perf_counter() - start,
+        num_points=frame.num_points,
+        detections=frame.detections,
+        detect_s=frame.detect_s,
+        other_s=frame.other_s + time.perf_counter() - start,
     )
-
-
-def _write_pictures(
-    sweep: io.Sweep,
-    cloud: PointCloud,
-    detections: Detections,
-    calibration: Calibration | None,
-    options: DetectOptions,
-) -> None:
-    min_score = max(SHOWN_MIN_SCORE, options.min_score)
-    labels = sweep.read_labels()
-    truth = judged = None
-    if labels is not None and calibration is not None:
-        truth = label_boxes(labels, calibration)
-        shown = np.asarray(detections.valid) & (np.asarray(detections.score) >= min_score)
-        judged = covered_by_labels(detections, labels, calibration)[shown]
-    pictures = draw_stages(
-        cloud,
-        detections,
-        calibration=calibration,
-        image=sweep.read_image(),
-        truth=truth,
-        judged=judged,
-        min_score=min_score,
-    )
-    for kind in SHOWN_PICTURES:
-        if kind in pictures:
-            save_png(options.output / PICTURE_FOLDER / f"{sweep.name}_{kind}.png", pictures[kind])
-
-
-def label_boxes(labels: Iterable[io.KittiObject], calibration: Calibration) -> BoxSet:
-    """The labelled vehicles, in the sensor frame."""
-    vehicles = [label for label in labels if label.type in VEHICLE_TYPES]
-    center, size, yaw = io.boxes_from_objects(vehicles, calibration)
-    return BoxSet(center=center, size=size, yaw=yaw)
-
-
-def covered_by_labels(
-    detections: Detections, labels: Iterable[io.KittiObject], calibration: Calibration
-) -> np.ndarray:
-    """(K,) bool: boxes that the labels speak about, in the image and in no DontCare region.
-
-    Args:
-      detections: of one sweep.
-      labels: all labels of the sweep.
-      calibration: of the camera whose image was labelled.
-
-    Returns:
-      (K,) bool, padding included.
-    """
-    projected = _project_boxes(detections.center, detections.size, detections.yaw, calibration)
-    boxes_px = np.asarray(projected.boxes_px, np.float64)
-    covered = np.asarray(projected.visible).copy()
-    for label in labels:
-        if label.is_dont_care:
-            covered &= (
-                image_fractions(boxes_px, np.asarray([label.box_px], np.float64))[:, 0] <= DONT_CARE_SHARE
-            )
-    return covered

@@ -7,9 +7,9 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxbox.cli.cache import CACHE_VARIABLE, enable_cache
-from jaxbox.cli.versions import versions
 from jaxbox.config import DetectorConfig
 from jaxbox.padding import CAPACITY_BUCKETS
+from jaxbox.versions import versions
 
 
 def print_info(console: Console, *, as_json: bool = False) -> None:

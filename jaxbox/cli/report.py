@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from rich.table import Table
@@ -59,6 +59,23 @@ class RunReport:
     """Sweeps that an earlier run had finished."""
     interrupted: bool = False
     """Whether the run was ended before its last sweep."""
+    repeated: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+    """Name and reason of those whose worker process died, and that were tried once more."""
+    jobs: int = 1
+    """Processes at work."""
+    elapsed_s: float = 0.0
+    """Seconds from the first sweep to the last, compiling included."""
+    compile_s: dict[int, float] = dataclasses.field(default_factory=dict)
+    """Seconds that each capacity took to compile, in the slowest process."""
+
+    def add_compile_times(self, seconds: Mapping[int, float]) -> None:
+        """Takes in what one process says.
+
+        Args:
+          seconds: by capacity.
+        """
+        for capacity, value in seconds.items():
+            self.compile_s[capacity] = max(value, self.compile_s.get(capacity, 0.0))
 
 
 def describe_frame(report: FrameReport, *, min_score: float = SHOWN_MIN_SCORE) -> list[str]:
@@ -90,22 +107,24 @@ def count_classes(detections: Detections, *, min_score: float) -> str:
     return ", ".join(parts) or "no vehicle"
 
 
-def describe_run(run: RunReport, compile_s: dict[int, float]) -> list[str]:
+def describe_run(run: RunReport) -> list[str]:
     """The summary: sweeps, times with compiling apart, and which status bits occurred how often.
 
     Args:
       run: what happened.
-      compile_s: seconds of compiling by capacity.
 
     Returns:
       A few lines.
     """
     skipped = f", {run.num_skipped} done before" if run.num_skipped else ""
     lines = [f"{len(run.frames)} sweeps done, {len(run.failures)} failed{skipped}"]
-    if compile_s:
-        parts = ", ".join(f"{seconds:.1f} s for {capacity} points" for capacity, seconds in compile_s.items())
-        lines.append(f"compiled (or loaded from the cache) once: {parts}")
+    if run.compile_s:
+        parts = [f"{seconds:.1f} s for {capacity} points" for capacity, seconds in run.compile_s.items()]
+        each = f" in each of {run.jobs} processes" if run.jobs > 1 else ""
+        lines.append(f"compiled (or loaded from the cache) once{each}: {', '.join(parts)}")
     if run.frames:
+        rate = len(run.frames) / max(run.elapsed_s, 1e-9)
+        lines.append(f"took {run.elapsed_s:.1f} s in all, {rate:.1f} sweeps a second")
         detect_ms = np.array([frame.detect_s for frame in run.frames]) * 1e3
         other_ms = np.array([frame.other_s for frame in run.frames]) * 1e3
         lines.append(
@@ -116,6 +135,7 @@ def describe_run(run: RunReport, compile_s: dict[int, float]) -> list[str]:
         count = sum(bit in frame.status for frame in run.frames) if bit else 0
         if count:
             lines.append(f"{bit.name} in {count} of {len(run.frames)} sweeps")
+    lines.extend(f"tried again: {name}: its process ended ({reason})" for name, reason in run.repeated)
     lines.extend(f"failed: {name}: {reason}" for name, reason in run.failures)
     return lines
 

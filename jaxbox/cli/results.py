@@ -12,15 +12,16 @@ from typing import Any
 import numpy as np
 
 from jaxbox import io
-from jaxbox.cli.versions import versions
 from jaxbox.config import DetectorConfig
 from jaxbox.io.jsonl import JSONL
 from jaxbox.io.mcap_results import MCAP_RESULTS
 from jaxbox.io.parquet import PARQUET
+from jaxbox.io.points import Points
 from jaxbox.io.rerun import RERUN
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
 from jaxbox.settings import changed_settings
 from jaxbox.types import Calibration, Detections
+from jaxbox.versions import versions
 
 CONFIG_NAME = "config.toml"
 """The exact settings, beside the results."""
@@ -91,6 +92,11 @@ class Results:
         """Whether a format holds the camera's image."""
         return RERUN in self._files
 
+    @property
+    def wants_points(self) -> bool:
+        """Whether a format holds the points."""
+        return self._points and any(file.wants_points for file in self._files)
+
     def is_finished(self, name: str) -> bool:
         """Whether every format holds a sweep already, from the run that is resumed."""
         if not self._resume:
@@ -104,7 +110,7 @@ class Results:
         detections: Detections,
         *,
         calibration: Calibration | None,
-        points: tuple[np.ndarray, np.ndarray],
+        points: Points | None,
         image: np.ndarray | None,
     ) -> Mapping[str, Any]:
         """Adds a sweep to every file: KITTI text where there is a camera, or JSON Lines in its place.
@@ -123,7 +129,7 @@ class Results:
             self.without_camera.append(sweep.name)
             files += [] if JSONL in files else [JSONL]
         for file in files:
-            xyz, intensity = points if file.wants_points and self._points else (None, None)
+            xyz, intensity = points if points is not None and file.wants_points else (None, None)
             result = SweepResult(
                 record=record, xyz=xyz, intensity=intensity, calibration=calibration, image=image
             )
