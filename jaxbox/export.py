@@ -4,7 +4,6 @@ What is exported takes plain arrays and gives a dictionary of plain arrays, beca
 interface would have to be there when it is loaded. ``docs/export.md`` tells how to run it.
 """
 
-import importlib.util
 import json
 import os
 import pathlib
@@ -100,12 +99,7 @@ def write_exported(folder: str | os.PathLike[str], exported: jax.export.Exported
 
     Returns:
       The files: `JAX_NAME`, `STABLEHLO_NAME` and `INTERFACE_NAME`.
-
-    Raises:
-      ImportError: without the export extra.
     """
-    if importlib.util.find_spec("flatbuffers") is None:
-        raise ImportError("exporting needs the export extra: pip install 'jaxbox[export]'")
     contents = {
         JAX_NAME: bytes(exported.serialize()),
         STABLEHLO_NAME: exported.mlir_module_serialized,

@@ -8,7 +8,8 @@ import pytest
 
 from jaxbox import synthetic
 from jaxbox.evaluation import corruptions
-from jaxbox.evaluation.corruptions import CORRUPTIONS, beam_numbers
+from jaxbox.evaluation.beams import beam_of_points
+from jaxbox.evaluation.corruptions import CORRUPTIONS
 
 OF_POINTS = sorted(name for name, kind in CORRUPTIONS.items() if kind.of_points)
 OF_CALIBRATION = sorted(name for name, kind in CORRUPTIONS.items() if kind.of_calibration)
@@ -79,29 +80,14 @@ def test_five_severities_that_go_from_none_one_way():
         assert (kind.of_points is None) != (kind.of_calibration is None)
 
 
-def test_beams_are_numbered_from_the_top_and_each_has_one_elevation(sweep):
-    beam = beam_numbers(sweep.xyz)
-    assert beam.max() + 1 <= NUM_BEAMS
-    assert np.all(np.diff(beam) >= 0)
-    elevation = np.degrees(np.arctan2(sweep.xyz[:, 2], np.hypot(sweep.xyz[:, 0], sweep.xyz[:, 1])))
-    for number in range(beam.max() + 1):
-        assert np.ptp(elevation[beam == number]) < 1e-3
-    assert beam_numbers(np.zeros((0, 3))).tolist() == []
-
-
 def test_thin_beams_keeps_the_lowest_beam_and_its_share(sweep):
-    beam = beam_numbers(sweep.xyz)
+    beam = beam_of_points(sweep.xyz)
     for one_in in (2, 4, 16):
         xyz, _ = corrupted("beams", sweep, one_in)
-        kept = np.unique(beam_numbers(xyz))
+        kept = np.unique(beam_of_points(xyz))
         assert len(kept) == (beam.max() + 1) // one_in
     lowest = sweep.xyz[beam == NUM_BEAMS - 1]
     np.testing.assert_array_equal(corrupted("beams", sweep, 16)[0][-len(lowest) :], lowest)
-
-
-def test_kitti_sweeps_have_64_beams(data_root):
-    for path in sorted((data_root / "kitti_object" / "training" / "velodyne").glob("*.bin")):
-        assert beam_numbers(np.fromfile(path, np.float32).reshape(-1, 4)[:, :3])[-1] == NUM_BEAMS - 1
 
 
 def test_lost_points_are_the_share(sweep):

@@ -70,7 +70,7 @@ def thin_beams(xyz: np.ndarray, *, num_beams: int, keep_every: int, first: int =
     # A beam without a return leaves no trace; a first or last point beyond the cut is a beam more.
     if len(xyz) and abs(found - num_beams) > max(1, _MAX_MISSING * num_beams):
         raise ValueError(
-            f"the azimuth turns {found} times and the sensor has {num_beams} beams: the points are not in the "
-            "order of beams. Take the sensor's own files, before they are sorted or moved."
+            f"the azimuth turns {found} times and the sensor has {num_beams} beams: the points are not in "
+            "the order of beams. Take the sensor's own files, before they are sorted or moved."
         )
     return beam % keep_every == first

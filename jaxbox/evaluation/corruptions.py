@@ -16,11 +16,10 @@ from collections.abc import Callable
 
 import numpy as np
 
+from jaxbox.evaluation.beams import beam_of_points
+
 Points = tuple[np.ndarray, np.ndarray]
 """(n, 3) float32, m, sensor frame; (n,) float32, the sensor's own unit."""
-
-BEAM_WRAP_RAD = 1.0
-"""A fall of the azimuth by more than this from one point to the next begins the next beam."""
 
 REACH_M = 120.0
 """Range to which a surface that reflects everything is seen in clear air (HDL-64E: 120 m for a car)."""
@@ -35,29 +34,11 @@ SWEEP_PERIOD_S = 0.1
 """Of one turn."""
 
 
-def beam_numbers(xyz: np.ndarray) -> np.ndarray:
-    """Numbers the beams of a sweep whose points come beam by beam, as KITTI's do.
-
-    Within a beam the azimuth grows from +x; where it falls back, the next beam begins.
-
-    Args:
-      xyz: (n, 3) m, sensor frame.
-
-    Returns:
-      (n,) int, from 0.
-
-    >>> beam_numbers(np.array([[1, 0.1, 0], [-1, 0.1, 0], [1, -0.1, 0], [1, 0.2, -1]])).tolist()
-    [0, 0, 0, 1]
-    """
-    azimuth = np.arctan2(xyz[:, 1], xyz[:, 0]) % math.tau
-    return np.cumsum(np.diff(azimuth, prepend=azimuth[:1]) < -BEAM_WRAP_RAD)
-
-
 def thin_beams(xyz: np.ndarray, intensity: np.ndarray, one_in: float, rng: np.random.Generator) -> Points:
     """Keeps every so many-th beam, as a sensor with fewer beams over the same angles would have them.
 
     Args:
-      xyz: (n, 3) m, beam by beam, see `beam_numbers`.
+      xyz: (n, 3) m, beam by beam, see `jaxbox.evaluation.beams.beam_of_points`.
       intensity: (n,).
       one_in: 1 keeps all (none lost), 2 every second, ...
       rng: not used, every run is the same.
@@ -66,7 +47,7 @@ def thin_beams(xyz: np.ndarray, intensity: np.ndarray, one_in: float, rng: np.ra
       The points of the beams kept: the last of each `one_in`, so that of 64 beams from the top the lowest,
       which shows the ground near by, is among them.
     """
-    beam = beam_numbers(xyz)
+    beam = beam_of_points(xyz)
     keep = beam % int(one_in) == int(one_in) - 1
     return xyz[keep], intensity[keep]
 

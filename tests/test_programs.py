@@ -1,0 +1,88 @@
+"""The kept program: the bits of `detect`, read and not traced the second time, traced anew when broken."""
+
+import dataclasses
+
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_detector import CAPACITY, found, street
+
+import jaxbox
+from jaxbox import DetectorConfig, PointCloud
+from jaxbox.cli import programs
+
+BASE = DetectorConfig()
+
+
+def changed(room, **values):
+    return dataclasses.replace(BASE, **{room: dataclasses.replace(getattr(BASE, room), **values)})
+
+
+def load(folder, config=BASE, *, capacity=CAPACITY):
+    """The program, as a new process gets it."""
+    programs._load_or_trace.cache_clear()
+    return programs.kept_program(config, capacity=capacity, folder=folder)
+
+
+@pytest.fixture
+def traced(monkeypatch):
+    """A quick stand-in for the detector's trace, and what it was asked for."""
+    asked = []
+
+    def trace(settings, capacity):
+        asked.append(capacity)
+        shapes = (capacity, 4), (capacity,), (), (settings.num_leaves,)
+        operands = [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes]
+        num_outputs = jax.tree.structure(programs._example(jaxbox.Detections)).num_leaves
+        return jax.export.export(jax.jit(lambda *_: [jnp.zeros(())] * num_outputs))(*operands)
+
+    monkeypatch.setattr(programs, "_trace", trace)
+    return asked
+
+
+def test_traced_or_read_it_has_the_bits_of_detect_and_thresholds_are_inputs(tmp_path):
+    cloud = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY)
+    jax.tree.map(np.testing.assert_array_equal, load(tmp_path)(cloud), found(0))
+    (path,) = (tmp_path / programs.FOLDER).iterdir()
+    written = path.stat().st_mtime_ns
+    strict = changed("vehicles", min_score=0.05)
+    answer = load(tmp_path, strict)(cloud)
+    assert path.stat().st_mtime_ns == written
+    jax.tree.map(np.testing.assert_array_equal, answer, jaxbox.detect(cloud, strict))
+    assert 0 < answer.valid.sum() < found(0).valid.sum()
+
+
+def test_it_is_traced_once_for_its_static_settings_and_capacity(traced, tmp_path):
+    load(tmp_path)
+    load(tmp_path)
+    load(tmp_path, changed("clustering", min_points=3.0))
+    assert traced == [CAPACITY]
+    load(tmp_path, capacity=2 * CAPACITY)
+    load(tmp_path, changed("vehicles", max_detections=16))
+    assert traced == [CAPACITY, 2 * CAPACITY, CAPACITY]
+    assert len(list((tmp_path / programs.FOLDER).iterdir())) == 3
+
+
+def test_a_broken_file_is_traced_anew(traced, tmp_path):
+    load(tmp_path)
+    (path,) = (tmp_path / programs.FOLDER).iterdir()
+    whole = path.read_bytes()
+    for broken in (b"", whole[: len(whole) // 2], b"\xff" * 64):
+        path.write_bytes(broken)
+        load(tmp_path)
+        load(tmp_path)
+    assert len(traced) == 4
+
+
+def test_a_folder_that_cannot_be_made_does_not_matter(traced, tmp_path):
+    (tmp_path / "file").touch()
+    load(tmp_path / "file")
+    assert traced == [CAPACITY]
+
+
+def test_settings_that_contradict_each_other_are_refused_though_a_program_is_kept(traced, tmp_path):
+    with pytest.raises(ValueError, match=r"evidence\.enabled"):
+        load(tmp_path, changed("evidence", enabled=False))
+    assert not traced
