@@ -204,7 +204,12 @@ def test_the_colours_mean_what_they_say(frame, detections):
     assert (on_vehicle | street(0).is_ground)[on_label].mean() > 0.98
     assert on_vehicle[on_label].mean() > 0.8
     ids = np.asarray(detections.point_detection)[: len(frame.xyz)]
-    assert len(np.unique(colors["vehicle"][ids == ids.max()], axis=0)) == 1
+    score = np.asarray(detections.score)[ids]
+    hidden = (ids < 0) | (score < View().min_score)
+    # Points of vehicles that are not shown are as grey as those of none.
+    grey = np.ptp(colors["vehicle"].astype(int), axis=1) < 20
+    assert np.array_equal(grey, hidden)
+    assert len(np.unique(colors["vehicle"][ids == 0], axis=0)) == 1
 
 
 # Thresholds and settings.

@@ -35,7 +35,7 @@ _LOOKS: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float
     "behind": ((-17.0, 0.0, 11.0), (7.0, 0.0, -2.0)),
     # Not straight down: the direction that is up on the screen would be any.
     "above": ((9.9, 0.0, 75.0), (10.0, 0.0, 0.0)),
-    "driver": ((0.0, 0.0, 0.3), (20.0, 0.0, -1.0)),
+    "driver": ((-2.0, 0.0, 1.5), (20.0, 0.0, -1.5)),
 }
 """Places of the camera and what it looks at, m, sensor frame."""
 
@@ -127,7 +127,7 @@ class ViserPage:
         self._server.scene.set_background_image(pixel, format="png")
         position, target = _LOOKS["behind"]
         self._server.initial_camera.position, self._server.initial_camera.look_at = position, target
-        self._server.scene.add_frame("/sensor", axes_length=1.0, axes_radius=0.03)
+        self._server.scene.add_frame("/sensor", axes_length=0.5, axes_radius=0.015)
 
     def _build_timeline(self, wanted: Wanted, num_sweeps: int) -> tuple[Any, Any, Any, Any]:
         many = num_sweeps > 1

@@ -109,7 +109,7 @@ def build_scene(frame: Frame, detections: Detections | None, view: View) -> Scen
     captions = [*_captions(boxes), *_captions(vehicles, below=True), *_captions(others, below=True)]
     return Scene(
         points=frame.xyz,
-        colors=COLORINGS[view.coloring](frame, detections),
+        colors=COLORINGS[view.coloring](frame, detections, view),
         lines=lines,
         captions=tuple(captions if view.captions else ()),
         image=_camera_picture(frame, boxes, vehicles, others),
@@ -171,21 +171,24 @@ def _camera_picture(frame: Frame, boxes: BoxSet, vehicles: BoxSet, others: BoxSe
     return draw_image_boxes(frame.image, frame.calibration, groups=groups, legend=False)
 
 
-def _by_height(frame: Frame, detections: Detections | None) -> np.ndarray:
+def _by_height(frame: Frame, detections: Detections | None, _: View) -> np.ndarray:
     return color_by_height(_height_above_ground(frame, detections))
 
 
-def _by_cluster(frame: Frame, detections: Detections | None) -> np.ndarray:
+def _by_cluster(frame: Frame, detections: Detections | None, _: View) -> np.ndarray:
     return color_by_id(_rows_of(frame, None if detections is None else detections.point_component))
 
 
-def _by_vehicle(frame: Frame, detections: Detections | None) -> np.ndarray:
+def _by_vehicle(frame: Frame, detections: Detections | None, view: View) -> np.ndarray:
     ids = _rows_of(frame, None if detections is None else detections.point_detection)
+    if detections is not None:
+        shown = np.asarray(detections.score, np.float64) >= view.min_score
+        ids = np.where(shown[ids], ids, -1)
     shades = shade_by_height(_height_above_ground(frame, detections))
     return np.where(ids[:, None] < 0, shades, color_by_id(ids))
 
 
-def _by_ground(frame: Frame, detections: Detections | None) -> np.ndarray:
+def _by_ground(frame: Frame, detections: Detections | None, _: View) -> np.ndarray:
     is_ground = (
         np.zeros(len(frame.rows), bool)
         if detections is None
@@ -194,7 +197,7 @@ def _by_ground(frame: Frame, detections: Detections | None) -> np.ndarray:
     return np.where(is_ground[:, None], GROUND_COLOR, OBSTACLE_COLOR).astype(np.uint8)
 
 
-def _by_label(frame: Frame, detections: Detections | None) -> np.ndarray:
+def _by_label(frame: Frame, detections: Detections | None, _: View) -> np.ndarray:
     colors = shade_by_height(_height_above_ground(frame, detections))
     for labels, color in ((frame.others, IGNORED), (frame.vehicles, TRUTH)):
         if labels is not None:
@@ -202,13 +205,13 @@ def _by_label(frame: Frame, detections: Detections | None) -> np.ndarray:
     return colors
 
 
-def _by_intensity(frame: Frame, _: Detections | None) -> np.ndarray:
+def _by_intensity(frame: Frame, _: Detections | None, __: View) -> np.ndarray:
     shown = np.where(np.isfinite(frame.intensity), frame.intensity, 0)
     high = np.percentile(shown, _INTENSITY_TOP) if len(shown) else 0
     return color_by_height(shown, low_m=0, high_m=float(high) or 1.0)
 
 
-Coloring = Callable[[Frame, Detections | None], np.ndarray]
+Coloring = Callable[[Frame, Detections | None, View], np.ndarray]
 """(n, 3) uint8 of a frame's points, with or without an answer."""
 
 COLORINGS: Mapping[str, Coloring] = {
