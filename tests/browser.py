@@ -24,7 +24,7 @@ FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
 )
-SIZE_PX = (1280, 720)
+SIZE_PX = (1000, 640)
 WAIT_S = 180
 """Longer than compiling takes; only a test that fails waits for so long."""
 LOOPBACK = ("127.0.0.1", "localhost")
