@@ -1,5 +1,6 @@
 """`jaxbox detect` and `info` on other formats: what is written, resumed, interrupted and told to scripts."""
 
+import contextlib
 import json
 import os
 import signal
@@ -39,6 +40,16 @@ def sweeps(tmp_path_factory):
     np.save(folder / "b.npy", np.vstack([street.xyz, np.full((5, 3), np.nan)]))
     (folder / "c.bin").write_bytes(b"")
     return folder
+
+
+@contextlib.contextmanager
+def heard_ctrl_c():
+    """A process that was started in the background ignores Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def detect(output, *arguments):
@@ -152,8 +163,6 @@ def test_interrupted_the_files_are_whole_and_the_rest_can_be_resumed(
 ):
     paths = sorted(sweeps.iterdir())
     read = io.Sweep.read_points
-    # A process that was started in the background ignores Ctrl-C.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def interrupted(self):
         # It is read while "b" is computed, which may or may not be written by the time of the signal.
@@ -161,10 +170,9 @@ def test_interrupted_the_files_are_whole_and_the_rest_can_be_resumed(
             os.kill(os.getpid(), number)
         return read(self)
 
-    with monkeypatch.context() as patch:
+    with monkeypatch.context() as patch, heard_ctrl_c():
         patch.setattr(io.Sweep, "read_points", interrupted)
         result = detect(tmp_path, *paths, *ONE_FILE)
-    signal.signal(signal.SIGINT, before)
     assert result.exit_code == 1
     assert "--resume goes on" in result.stderr
     done = [record["name"] for record in records_of(tmp_path)]

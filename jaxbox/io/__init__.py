@@ -1,6 +1,6 @@
 """Files in and out: points and recordings of every kind, data sets' layouts, labels, images, and results."""
 
-from jaxbox.io._files import InputError, atomic_path, atomic_writer
+from jaxbox.io._files import InputError, atomic_path, atomic_writer, remove_abandoned
 from jaxbox.io.argoverse2 import (
     read_argoverse2_boxes,
     read_argoverse2_ground,
@@ -74,6 +74,7 @@ __all__ = [
     "read_raw_calibration",
     "read_semantic_labels",
     "read_text_points",
+    "remove_abandoned",
     "write_bin",
     "write_calibration",
     "write_config",

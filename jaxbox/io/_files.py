@@ -6,9 +6,15 @@ import math
 import os
 import pathlib
 import stat
+import sys
 import tempfile
 from collections.abc import Iterator
 from typing import Any, TextIO
+
+if sys.platform == "win32":
+    fcntl = None
+else:
+    import fcntl
 
 
 class InputError(ValueError):
@@ -23,6 +29,8 @@ MAX_TEXT_BYTES = 2**28
 
 
 _MAX_REASON = 200
+_TEMPORARY = ".jaxbox-"
+"""How the names of temporary files begin; hidden, so that no folder's sweeps are found in them."""
 
 
 def check_file(path: str | os.PathLike[str], *, max_bytes: int | None = MAX_SWEEP_BYTES) -> int:
@@ -156,19 +164,29 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     """Lends a temporary file that takes its name only once the block has ended well.
 
     A crash or an error within the block leaves whatever stood at `path` as it was. The temporary file
-    lies in the same folder, because a rename is atomic only within one file system.
+    lies in the same folder, because a rename is atomic only within one file system. A process that is
+    killed leaves it there; `remove_abandoned` takes it away.
 
     Args:
       path: the file; its folder is made where it is missing.
 
     Yields:
       Path of an empty file with the same suffix, to be written by any means.
+
+    Raises:
+      OSError: naming the file, where its folder cannot be made or written.
     """
     target = pathlib.Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.stem}.", suffix=target.suffix)
-    os.close(handle)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=target.parent, prefix=_TEMPORARY, suffix=target.suffix)
+    except OSError as error:
+        raise type(error)(error.errno, error.strerror, str(target)) from error
     temporary = pathlib.Path(name)
+    # Held while the file is written, and given up by the system when the process ends in any way.
+    is_locked = _try_lock(handle)
+    if not is_locked:
+        os.close(handle)
     try:
         yield temporary
         # mkstemp makes the file private; a result is to be as readable as any other new file.
@@ -177,6 +195,36 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
+    finally:
+        if is_locked:
+            os.close(handle)
+
+
+def remove_abandoned(folder: str | os.PathLike[str]) -> None:
+    """Removes temporary files of `atomic_path` whose process was killed before it could do so itself.
+
+    Args:
+      folder: where they would lie; it need not be there. Those that are still written are left alone.
+    """
+    for path in pathlib.Path(folder).glob(f"{_TEMPORARY}*"):
+        with contextlib.suppress(OSError):
+            handle = os.open(path, os.O_RDWR)
+            try:
+                if _try_lock(handle):
+                    path.unlink()
+            finally:
+                os.close(handle)
+
+
+def _try_lock(handle: int) -> bool:
+    """Locks an open file for this process alone; False where another holds it, or files have no locks."""
+    if fcntl is None:
+        return False
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
 
 
 @contextlib.contextmanager
