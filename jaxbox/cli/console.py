@@ -19,6 +19,10 @@ FILE_WIDTH = 120
 """Columns of a table where stdout is no terminal: wide enough for all of them."""
 
 
+class OutputError(Exception):
+    """Results cannot be written, so that a run cannot go on; the message names the file and the mend."""
+
+
 class ExitCode(enum.IntEnum):
     """How a command ended."""
 
@@ -52,7 +56,7 @@ def input_errors() -> Iterator[None]:
     """
     try:
         yield
-    except (InputError, OSError, ImportError) as error:
+    except (InputError, OutputError, OSError, ImportError) as error:
         print_error(str(error))
         raise typer.Exit(ExitCode.BAD_INPUT) from error
 
@@ -76,6 +80,30 @@ def stoppable() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def undisturbed() -> Iterator[None]:
+    """Puts Ctrl-C and SIGTERM off until a block has ended, so that what it writes belongs together.
+
+    Raises:
+      KeyboardInterrupt: after the block, where one of them came.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []
+    before = {
+        number: signal.signal(number, lambda number, _: came.append(number))
+        for number in (signal.SIGINT, signal.SIGTERM)
+    }
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if came:
+            raise KeyboardInterrupt
 
 
 def make_progress(*, shown: bool) -> Progress:

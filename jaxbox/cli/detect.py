@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from rich.progress import Progress
 
 from jaxbox import io
-from jaxbox.cli.console import ExitCode, make_progress, print_error, stderr, stdout, stoppable
+from jaxbox.cli.console import ExitCode, make_progress, print_error, stderr, stdout, stoppable, undisturbed
 from jaxbox.cli.frames import Frame, FrameSource, FrameWork
 from jaxbox.cli.report import (
     SHOWN_MIN_SCORE,
@@ -19,7 +19,7 @@ from jaxbox.cli.report import (
     describe_frame,
     describe_run,
 )
-from jaxbox.cli.results import ResultFormat, Results, RunAccount
+from jaxbox.cli.results import ResultFormat, Results, RunAccount, written
 from jaxbox.config import DetectorConfig
 from jaxbox.io.jsonl import JSONL
 from jaxbox.workers import WorkerDied
@@ -83,7 +83,10 @@ def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
       InputError: where a path holds no sweeps, or the options cannot be used.
     """
     sweeps = io.open_sweeps(paths, topic=options.topic)
-    options.output.mkdir(parents=True, exist_ok=True)
+    with written(options.output):
+        options.output.mkdir(parents=True, exist_ok=True)
+    for folder in (options.output, options.output / PICTURE_FOLDER):
+        io.remove_abandoned(folder)
     account = RunAccount(
         output=options.output,
         config=options.config,
@@ -221,13 +224,14 @@ def _write(
 ) -> FrameReport:
     """Writes the results; that there are no pictures is said after that."""
     start = time.perf_counter()
-    record = results.write(
-        sweep,
-        frame.detections,
-        calibration=frame.calibration,
-        points=frame.points,
-        image=frame.image,
-    )
+    with undisturbed():
+        record = results.write(
+            sweep,
+            frame.detections,
+            calibration=frame.calibration,
+            points=frame.points,
+            image=frame.image,
+        )
     if options.json:
         health = frame.detections.summary(options.config).to_dict()
         timing = {"num_points": frame.num_points, "detect_ms": round(frame.detect_s * 1e3, 3)}

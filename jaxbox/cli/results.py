@@ -6,12 +6,13 @@ import datetime
 import enum
 import json
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from jaxbox import io
+from jaxbox.cli.console import OutputError
 from jaxbox.config import DetectorConfig
 from jaxbox.io.jsonl import JSONL
 from jaxbox.io.mcap_results import MCAP_RESULTS
@@ -47,6 +48,25 @@ FILES: Mapping[ResultFormat, ResultFile] = {
     ResultFormat.RERUN: RERUN,
 }
 """Formats of one file a run; KITTI text is one a sweep."""
+
+
+@contextlib.contextmanager
+def written(path: pathlib.Path) -> Iterator[None]:
+    """Tells failures to write from failures to read: after the first a run cannot go on.
+
+    Args:
+      path: the file or folder, for the error.
+
+    Raises:
+      OutputError: in place of an OSError of the block.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot be written ({error.strerror or error}). Free space or mend the permissions, and "
+            "run the same command with --resume; or choose another --output."
+        ) from error
 
 
 class Results:
@@ -85,7 +105,8 @@ class Results:
         return self
 
     def __exit__(self, *error: Any) -> None:
-        self._stack.__exit__(*error)
+        with written(self._output):
+            self._stack.__exit__(*error)
 
     @property
     def wants_image(self) -> bool:
@@ -124,7 +145,8 @@ class Results:
         files = list(self._files)
         if self._kitti and calibration is not None:
             objects = io.objects_from_detections(detections, calibration, min_score=self._min_score)
-            io.write_labels(self._text_path(sweep.name), objects)
+            with written(self._text_path(sweep.name)):
+                io.write_labels(self._text_path(sweep.name), objects)
         elif self._kitti:
             self.without_camera.append(sweep.name)
             files += [] if JSONL in files else [JSONL]
@@ -134,7 +156,8 @@ class Results:
                 record=record, xyz=xyz, intensity=intensity, calibration=calibration, image=image
             )
             if sweep.name not in self._finished.get(file.name, ()):
-                self._writer(file)(result)
+                with written(self._output / file.name):
+                    self._writer(file)(result)
         return record
 
     def _writer(self, file: ResultFile) -> WriteResult:
@@ -171,7 +194,7 @@ class RunAccount:
             return
         earlier = io.read_config(self.output / CONFIG_NAME, base=self.config)
         differing = list(changed_settings(earlier, self.config))
-        with contextlib.suppress(ValueError, TypeError, KeyError, io.InputError):
+        with contextlib.suppress(ValueError, TypeError, KeyError, RecursionError, io.InputError):
             options = json.loads((self.output / RUN_NAME).read_text("utf-8"))["options"]
             differing += [name for name, value in self.options.items() if options[name] != value]
         if differing:
@@ -183,7 +206,6 @@ class RunAccount:
 
     def write(self, **outcome: Any) -> None:
         """Writes the two files; before the run without an outcome, and after it."""
-        io.write_config(self.output / CONFIG_NAME, self.config)
         account = {
             "versions": versions(),
             "inputs": list(self.inputs),
@@ -191,5 +213,7 @@ class RunAccount:
             "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             **outcome,
         }
-        with io.atomic_writer(self.output / RUN_NAME) as handle:
-            handle.write(json.dumps(account, indent=2) + "\n")
+        with written(self.output / RUN_NAME):
+            io.write_config(self.output / CONFIG_NAME, self.config)
+            with io.atomic_writer(self.output / RUN_NAME) as handle:
+                handle.write(json.dumps(account, indent=2) + "\n")
