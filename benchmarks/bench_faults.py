@@ -1,0 +1,160 @@
+"""What a killed `jaxbox detect` leaves behind, and whether a resumed run ends with the same results.
+
+    python -m benchmarks.bench_faults [--kills 50] [--sweeps 8] [--json FILE]
+
+A run over synthetic sweeps is killed (SIGKILL) at random moments from its start to its usual end, and the
+same command with ``--resume`` is started over and over, until it was killed so many times and then left alone.
+KITTI text, JSON Lines, Parquet and pictures have to be those of a run that nothing disturbed, byte for byte.
+After each kill every file that has its name is read: it has to be whole.
+"""
+
+import argparse
+import collections
+import json
+import pathlib
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from benchmarks import common
+from jaxbox import io, synthetic
+from jaxbox.io.parquet import finished_parquet
+
+KILLS, SWEEPS = 50, 8
+NUM_AZIMUTHS = 250
+"""Small sweeps, of the smallest capacity."""
+OPTIONS = ("--format", "kitti", "--format", "jsonl", "--format", "parquet")
+ACCOUNTS = ("run.json",)
+"""Files that say when a run was; all others have to be the same."""
+_MARGIN = 1.1
+"""Kills come up to a tenth later than a run usually ends."""
+
+
+def write_sweeps(folder: pathlib.Path, count: int) -> None:
+    """Synthetic sweeps with a camera, in KITTI's object layout."""
+    for seed in range(count):
+        sweep = synthetic.make_sweep(seed, num_azimuths=NUM_AZIMUTHS)
+        io.write_bin(folder / "velodyne" / f"{seed:06d}.bin", sweep.xyz, sweep.intensity)
+        io.write_calibration(folder / "calib" / f"{seed:06d}.txt", sweep.calibration)
+
+
+def command(sweeps: pathlib.Path, output: pathlib.Path, *options: str) -> list[str]:
+    """The command line of a run, in a process of its own."""
+    return [
+        *(sys.executable, "-m", "jaxbox", "detect", str(sweeps), "--output", str(output)),
+        *OPTIONS,
+        *options,
+    ]
+
+
+def run(words: list[str], *, kill_after_s: float | None = None) -> int:
+    """Runs a command, killed after so long; returns its exit code, negative for a signal."""
+    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        return process.wait(kill_after_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
+
+
+def contents(folder: pathlib.Path) -> dict[str, bytes]:
+    """Every file below a folder, but those that tell the time."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path.name not in ACCOUNTS)
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+def broken(folder: pathlib.Path) -> list[str]:
+    """Files that have their names and cannot be read; hidden ones are still to be named."""
+    readers = {
+        ".txt": io.read_labels,
+        ".jsonl": io.read_jsonl,
+        ".parquet": finished_parquet,
+        ".png": io.read_image,
+        ".toml": io.read_config,
+        ".json": lambda path: json.loads(path.read_text("utf-8")),
+    }
+    found = []
+    for path in folder.rglob("*"):
+        if path.is_file() and not path.name.startswith("."):
+            try:
+                readers[path.suffix](path)
+            except ValueError as error:
+                found.append(f"{path.name}: {error}")
+    return found
+
+
+def stage_of(files: Mapping[str, Any], num_sweeps: int) -> str:
+    """How far a killed run had come, by the files with names."""
+    texts = sum(name.endswith(".txt") for name in files)
+    if "run.json" not in files:
+        return "before its first file"
+    if "detections.parquet" in files:
+        return "after its last result file"
+    return f"with {'no' if not texts else 'all' if texts == num_sweeps else 'some'} sweeps done"
+
+
+def kill_and_resume(sweeps: pathlib.Path, root: pathlib.Path, *, kills: int, seed: int) -> dict[str, Any]:
+    """Runs undisturbed, then killed and resumed so many times.
+
+    Args:
+      sweeps: of `write_sweeps`.
+      root: an empty folder for the results.
+      kills: how many processes are killed.
+      seed: of the moments.
+
+    Returns:
+      What happened: when kills came, how far the runs had come, files that differ or were broken.
+    """
+    plain, killed = root / "undisturbed", root / "killed"
+    start = time.monotonic()
+    if run(command(sweeps, plain)):
+        raise SystemExit("the undisturbed run failed")
+    usual_s = time.monotonic() - start
+    rng = random.Random(seed)
+    reached: collections.Counter[str] = collections.Counter()
+    half_written, num_killed, num_ended = [], 0, 0
+    while num_killed < kills:
+        # A run that ended by itself has nothing left to do: the next begins anew.
+        if run(command(sweeps, killed, "--resume"), kill_after_s=rng.uniform(0, _MARGIN * usual_s)) < 0:
+            num_killed += 1
+            names = [str(path.relative_to(killed)) for path in killed.rglob("*")]
+            reached[stage_of(dict.fromkeys(names), len(list((sweeps / "velodyne").iterdir())))] += 1
+            half_written += broken(killed)
+        else:
+            num_ended += 1
+            if num_killed < kills:
+                (killed / "detections.parquet").unlink()
+    code = run(command(sweeps, killed, "--resume"))
+    expected, found = contents(plain), contents(killed)
+    differing = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
+    return {
+        "kills": num_killed, "ended_by_themselves": num_ended, "usual_s": usual_s,
+        "reached": dict(sorted(reached.items())), "half_written": half_written,
+        "final_exit_code": code, "files": len(expected), "differing": differing,
+    }  # fmt: skip
+
+
+def main() -> None:
+    """Prints what happened; ends with 1 where results differ or a file was broken."""
+    options = argparse.ArgumentParser(description="A killed and resumed jaxbox detect.")
+    options.add_argument("--kills", type=int, default=KILLS)
+    options.add_argument("--sweeps", type=int, default=SWEEPS)
+    options.add_argument("--seed", type=int, default=0, help="of the moments of the kills")
+    options.add_argument("--json", type=pathlib.Path, help="also write the report to this file")
+    chosen = options.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        root = pathlib.Path(name)
+        write_sweeps(root / "sweeps", chosen.sweeps)
+        report = kill_and_resume(root / "sweeps", root, kills=chosen.kills, seed=chosen.seed)
+    for key, value in report.items():
+        print(f"{key}: {value}")
+    common.write_report(report, chosen)
+    sys.exit(int(bool(report["differing"] or report["half_written"] or report["final_exit_code"])))
+
+
+if __name__ == "__main__":
+    main()
