@@ -3,7 +3,7 @@
     python -m benchmarks.bench_faults [--kills 50] [--sweeps 8] [--json FILE]
 
 A run over synthetic sweeps is killed (SIGKILL) at random moments from its start to its usual end, and the
-same command with ``--resume`` is started over and over, until it was killed so many times and then left alone.
+same command with ``--resume`` is started over and over, until it was killed so often, and then left alone.
 KITTI text, JSON Lines, Parquet and pictures have to be those of a run that nothing disturbed, byte for byte.
 After each kill every file that has its name is read: it has to be whole.
 """

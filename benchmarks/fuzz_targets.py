@@ -455,6 +455,38 @@ TARGETS: Mapping[str, Target] = {
 """Every reader, by the name that `fuzz_readers` knows it by."""
 
 
+def mutated(data: bytes, rng: np.random.Generator) -> bytes:
+    """A copy with one to four places changed: bytes, whole numbers, cut off, left out or said twice.
+
+    Args:
+      data: a whole file.
+      rng: chooses what and where.
+
+    Returns:
+      The changed bytes.
+    """
+    changed = bytearray(data)
+    for _ in range(rng.integers(1, 5)):
+        place, kind = int(rng.integers(len(changed) + 1)), int(rng.integers(6))
+        length = int(rng.integers(1, 17))
+        if kind == 0:
+            changed[place : place + 1] = bytes([rng.integers(256)])
+        elif kind == 1:
+            changed[place : place + 4] = _NUMBERS[rng.integers(len(_NUMBERS))].to_bytes(4, "little")
+        elif kind == 2:
+            changed[place : place + 8] = (2 ** int(rng.integers(64)) - 1).to_bytes(8, "little")
+        elif kind == 3:
+            del changed[place : place + length]
+        elif kind == 4:
+            changed[place:place] = changed[place : place + length]
+        else:
+            del changed[place:]
+    return bytes(changed)
+
+
+_NUMBERS = (0, 1, 2**7, 2**8, 2**15, 2**16, 2**31 - 1, 2**31, 2**32 - 1)
+
+
 @contextlib.contextmanager
 def prepared(target: Target, root: pathlib.Path) -> Iterator[Callable[[bytes], None]]:
     """Lends a function that feeds the reader with bytes, by way of a file below a folder.

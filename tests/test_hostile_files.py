@@ -1,10 +1,12 @@
 """Files made to hang a reader, fill the memory or lead out of the output folder: refused at once, by name."""
 
 import bz2
+import contextlib
 import io as bytes_io
 import json
 import os
 import pathlib
+import sqlite3
 import struct
 import subprocess
 import sys
@@ -319,6 +321,24 @@ def test_a_pipe_in_the_place_of_a_bags_storage_is_refused(tmp_path):
         os.mkfifo(folder / f"{storage}{suffix}")
         with pytest.raises(io.InputError, match="no plain file"):
             io.open_sweeps(folder)
+
+
+def test_a_database_with_a_query_in_the_place_of_a_table_is_refused(tmp_path):
+    write_bag2(tmp_path / "bag", ["/points"], "SQLITE3")
+    file = tmp_path / "bag" / "bag.db3"
+    endless = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
+    with contextlib.closing(sqlite3.connect(file)) as database:
+        database.execute("DROP TABLE messages")
+        database.execute(
+            f"CREATE VIEW messages AS {endless} SELECT i id, 1 topic_id, i timestamp, '' data FROM n"
+        )
+        # The library looks for tables by this column alone.
+        database.execute("PRAGMA writable_schema = 1")
+        database.execute("UPDATE sqlite_master SET type = 'table' WHERE name = 'messages'")
+        database.commit()
+    for path in (file, file.parent):
+        with pytest.raises(io.InputError, match=r"bag\.db3: 'messages' is no plain table"):
+            io.open_sweeps(path)
 
 
 def test_metadata_that_names_files_elsewhere_does_not_lead_there(tmp_path):

@@ -139,6 +139,31 @@ def peers() -> str:
     return table(["", "median ms", "p99 ms", "clusters", "boxes", "recall"], rows) + made_with(report)
 
 
+def fuzz() -> str:
+    """What each reader was fed with, and how much of it is still a finding."""
+    report = load("fuzz")
+    rows = [
+        (f"`{name}`", *(r[n] for n in ("minutes", "cpu_minutes", "executions")), len(r["findings"]) or "none")
+        for name, r in report["readers"].items()
+    ]
+    header = ["reader", "minutes", "processor minutes", "files read", "open findings"]
+    return table(header, rows) + made_with(report)
+
+
+def faults() -> str:
+    """Kills, and what they did."""
+    report = load("faults")
+    rows = [("runs killed", report["kills"])]
+    rows += [(f"... {stage}", count) for stage, count in report["reached"].items()]
+    rows += [
+        ("runs that ended before their kill", report["ended_by_themselves"]),
+        ("files that were half written", len(report["half_written"])),
+        ("files compared at the end", report["files"]),
+        ("files that differ", len(report["differing"])),
+    ]
+    return table(["", "count"], rows) + made_with(report)
+
+
 def status() -> str:
     """Every bit and its sentence."""
     bits = [bit for bit in Status if bit.value]
@@ -164,6 +189,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "speed": speed,
     "frontier": frontier,
     "peers": peers,
+    "fuzz": fuzz,
+    "faults": faults,
     "status": status,
     "counts": counts,
 }

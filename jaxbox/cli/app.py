@@ -44,7 +44,7 @@ DrivesOption = Annotated[
 
 EXIT_CODES = (
     "Exit codes: 0 all went well; 1 some sweeps failed or it was interrupted, the others are done; "
-    "2 the input or an option cannot be used."
+    "2 the input or an option cannot be used, or results cannot be written."
 )
 
 DETECT_EXAMPLES = """Examples:

@@ -21,6 +21,7 @@ from jaxbox.io.points import (
     check_num_points,
     check_unpacked,
     named_points,
+    read_number_lines,
 )
 
 _MAX_HEADER_LINES = 64
@@ -117,17 +118,7 @@ def _check_body(file: BinaryIO, header: Any, size: int, where: str) -> None:
 
 def _read_ascii(file: BinaryIO, header: Any, where: str) -> dict[str, np.ndarray]:
     names = header.build_dtype().names
-    try:
-        rows = (
-            np.loadtxt(file, ndmin=2, max_rows=header.points) if header.points else np.zeros((0, len(names)))
-        )
-    except ValueError as error:
-        raise InputError(f"{where}: {error}; each line of points needs {len(names)} numbers.") from error
-    if rows.shape != (header.points, len(names)):
-        raise InputError(
-            f"{where}: {rows.shape[0]} lines of {rows.shape[1]} numbers; the header promises "
-            f"{header.points} of {len(names)}. Copy the file again if it was cut short."
-        )
+    rows = read_number_lines(file, header.points, len(names), where)
     return dict(zip(names, rows.T, strict=True))
 
 

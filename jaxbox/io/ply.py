@@ -12,7 +12,14 @@ from typing import BinaryIO
 import numpy as np
 
 from jaxbox.io._files import InputError, check_file, reason
-from jaxbox.io.points import PointFormat, Points, check_num_bytes, check_num_points, named_points
+from jaxbox.io.points import (
+    PointFormat,
+    Points,
+    check_num_bytes,
+    check_num_points,
+    named_points,
+    read_number_lines,
+)
 
 _MAX_HEADER_LINES = 1024
 _MAX_LINE_BYTES = 65536
@@ -83,17 +90,10 @@ def _read_header(file: BinaryIO, where: str) -> tuple[str, int, np.dtype]:
 
 
 def _read_ascii(file: BinaryIO, count: int, dtype: np.dtype, where: str) -> np.ndarray:
-    width = len(dtype.names or ())
-    try:
-        rows = np.loadtxt(file, ndmin=2, max_rows=count) if count else np.zeros((0, width))
-    except ValueError as error:
-        raise InputError(f"{where}: {error}; each line of a vertex needs {width} numbers.") from error
-    if rows.shape != (count, width):
-        raise InputError(
-            f"{where}: {rows.shape[0]} lines of {rows.shape[1]} numbers; the header promises {count} of "
-            f"{width}. Copy the file again if it was cut short."
-        )
-    return np.rec.fromarrays(rows.T, dtype=dtype)
+    rows = read_number_lines(file, count, len(dtype.names or ()), where)
+    # Numbers beyond their type's range.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.rec.fromarrays(rows.T, dtype=dtype)
 
 
 PLY = PointFormat(name="PLY", suffixes=(".ply",), read=read_ply)

@@ -4,8 +4,9 @@ import array
 import dataclasses
 import os
 import pathlib
+import warnings
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -138,6 +139,40 @@ def check_num_bytes(needed: int, there: int, where: str) -> None:
             f"{where}: {there} bytes of points, and the header promises {needed}. "
             "The file was cut short: copy it again."
         )
+
+
+def read_number_lines(file: BinaryIO, count: int, columns: int, where: str) -> np.ndarray:
+    """Reads lines of numbers, as the text bodies of PCD and PLY are.
+
+    Args:
+      file: where the lines begin.
+      count: lines that the header promises.
+      columns: numbers a line.
+      where: the file, for the error.
+
+    Returns:
+      (count, columns) float64.
+
+    Raises:
+      InputError: for other lines than these.
+    """
+    if count == 0:
+        return np.zeros((0, columns))
+    try:
+        with warnings.catch_warnings():
+            # That there are none is an error here.
+            warnings.simplefilter("ignore")
+            rows = np.loadtxt(file, ndmin=2, max_rows=count)
+    except ValueError as error:
+        raise InputError(
+            f"{where}: {reason(error)}; each line of a point needs {columns} numbers."
+        ) from error
+    if rows.shape != (count, columns):
+        raise InputError(
+            f"{where}: {rows.shape[0]} lines of {rows.shape[1]} numbers; the header promises {count} of "
+            f"{columns}. Copy the file again if it was cut short."
+        )
+    return rows
 
 
 def read_bin(path: str | os.PathLike[str]) -> Points:

@@ -7,6 +7,9 @@ distribution, and many bags hold none.
 import contextlib
 import functools
 import pathlib
+import re
+import sqlite3
+import urllib.parse
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,6 +24,7 @@ METADATA_NAME = "metadata.yaml"
 """What a folder of ROS 2 holds beside its storage."""
 
 _TYPE = MESSAGE_TYPES[0]
+_DATABASE = ".db3"
 _MAX_METADATA_BYTES = 2**24
 _PACKED_MESSAGES = "message"
 _MAX_PACKED_RATIO = 100
@@ -68,6 +72,7 @@ def _reader(path: pathlib.Path) -> Iterator[Any]:
     _check_files(path)
     try:
         _check_packed_files(path)
+        _check_schemas(path)
         with module.Reader(path) as reader:
             if _is_ros1(path):
                 _bound_chunks(reader, str(path))
@@ -85,6 +90,17 @@ def _check_files(path: pathlib.Path) -> None:
     """Refuses pipes and devices; of a folder, whatever its metadata may name."""
     for file in [file for file in path.iterdir() if not file.is_dir()] if path.is_dir() else [path]:
         check_file(file, max_bytes=_MAX_METADATA_BYTES if file.name == METADATA_NAME else None)
+
+
+def _check_schemas(path: pathlib.Path) -> None:
+    """Refuses databases of ROS 2 with views or virtual tables: those may be queries without end."""
+    for file in path.glob(f"*{_DATABASE}") if path.is_dir() else [path] * (path.suffix == _DATABASE):
+        uri = f"file:{urllib.parse.quote(str(file))}?immutable=1"
+        with contextlib.closing(sqlite3.connect(uri, uri=True)) as database:
+            rows = database.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL").fetchall()
+        for name, text in rows:
+            if not re.match(r"CREATE\s+(TABLE|(UNIQUE\s+)?INDEX)\s", str(text), re.IGNORECASE):
+                raise InputError(f"{file}: {name!r} is no plain table; export the recording with ros2 bag.")
 
 
 def _bound_chunks(reader: Any, where: str) -> None:
@@ -155,5 +171,5 @@ def is_rosbag2(path: pathlib.Path) -> bool:
 
 
 ROSBAG = RecordingFormat(
-    name="ROS 1 and ROS 2 bags", suffixes=(".bag", ".db3"), open=open_rosbag, is_folder=is_rosbag2
+    name="ROS 1 and ROS 2 bags", suffixes=(".bag", _DATABASE), open=open_rosbag, is_folder=is_rosbag2
 )
