@@ -1,6 +1,7 @@
 """Where the detector stops working: car accuracy on corrupted copies of KITTI's object sweeps.
 
     python -m benchmarks.bench_corruption [--only beams fog] [--copies 3] [--json FILE] [--plot PICTURE]
+    python -m benchmarks.bench_corruption --redraw FILE --plot PICTURE    # of an earlier report
 
 Each kind of `jaxbox.evaluation.corruptions` at five severities, beside the clean sweeps. A figure is the
 mean over turned and mirrored copies, see `bench_accuracy`; each copy is corrupted anew, with seeds of its
@@ -10,6 +11,7 @@ KITTI's labels are.
 """
 
 import dataclasses
+import json
 import pathlib
 import zlib
 from collections.abc import Mapping, Sequence
@@ -32,9 +34,10 @@ NUM_COPIES = 3
 METRICS = ("bev", "3d", "image")
 MIN_OVERLAP = {"Car": kitti.MIN_OVERLAP["Car"]}
 RECALL_OVERLAP = 0.5
-COLUMNS = ("3d", "bev", "image", "SOFT", "recall", "recall at the cut", "false a frame")
+COLUMNS = ("3d", "bev", "image", "SOFT", "recall", "recall at the cut", "false a frame", "length", "height")
 """AP at IoU .7 (R40, moderate), SOFT, and at BEV IoU .5 the recall of moderate cars by boxes of any score and
-by those from `jaxbox.DEFAULT_CUT` on, and how many of the latter a frame match no label."""
+by those from `jaxbox.DEFAULT_CUT` on, how many of the latter a frame match no label, and by how much (m) the
+boxes found are on average too long and too high."""
 PLOTTED = {"3d": "3D AP", "SOFT": "SOFT", "recall": "recall, BEV .5 (%)"}
 
 
@@ -82,12 +85,17 @@ def score(labels: kitti.Objects, results: kitti.Objects) -> dict[str, float]:
     every = matching.rates(scenes, metric="bev", min_overlap=RECALL_OVERLAP)
     cut = matching.cut(scenes, min_score=DEFAULT_CUT)
     kept = matching.rates(cut, metric="bev", min_overlap=RECALL_OVERLAP)
+    found = matching.matched_boxes(scenes, min_overlap=RECALL_OVERLAP)
+    # Without a match there is no error to report.
+    too_large = np.mean(found.detections - found.labels, axis=0) if len(found.labels) else np.zeros(7)
     return {
         **ap,
         "SOFT": kitti.soft_score(labels, results),
         "recall": every.num_found / every.num_labels,
         "recall at the cut": kept.num_found / kept.num_labels,
         "false a frame": kept.num_false / len(labels),
+        "length": float(too_large[3]),
+        "height": float(too_large[5]),
     }
 
 
@@ -114,7 +122,7 @@ def plot(report: Mapping[str, Any], path: pathlib.Path) -> None:
     kinds = report["corruptions"]
     columns = 3
     rows = -(-len(kinds) // columns)
-    figure = Figure(figsize=(11, 0.6 + 2.7 * rows), layout="constrained")
+    figure = Figure(figsize=(9, 0.5 + 2.2 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
     for panel, (name, kind) in zip(panels, kinds.items(), strict=False):
         rungs = [report[CLEAN], *kind["severities"]]
@@ -123,7 +131,7 @@ def plot(report: Mapping[str, Any], path: pathlib.Path) -> None:
             mean = [scale * rung["mean"][key] for rung in rungs]
             sd = [scale * rung["sd"][key] for rung in rungs]
             panel.errorbar(range(len(rungs)), mean, yerr=sd, marker="o", markersize=3, capsize=2, label=label)
-        panel.set_title(f"{CORRUPTIONS[name].title} ({kind['unit']})", fontsize=9)
+        panel.set_title(f"{CORRUPTIONS[name].title} ({CORRUPTIONS[name].unit})", fontsize=9)
         ticks = [CLEAN, *(f"{rung['amount']:g}" for rung in kind["severities"])]
         panel.set_xticks(range(len(ticks)), ticks, fontsize=8)
         panel.set_ylim(0, 100)
@@ -139,7 +147,8 @@ def print_report(report: Mapping[str, Any]) -> None:
     for name, kind in report["corruptions"].items():
         for rung in kind["severities"]:
             figures = [rung["mean"][c] for c in COLUMNS]
-            rows.append([name, f"{rung['amount']:g} {kind['unit']}", *figures, ", ".join(rung["status"])])
+            amount = f"{rung['amount']:g} {CORRUPTIONS[name].unit}"
+            rows.append([name, amount, *figures, ", ".join(rung["status"])])
     common.print_table(["", "amount", *COLUMNS, "status"], rows)
 
 
@@ -149,7 +158,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--copies", type=int, default=NUM_COPIES, choices=range(1, len(COPIES) + 1))
     parser.add_argument("--only", nargs="+", choices=sorted(CORRUPTIONS), default=list(CORRUPTIONS))
     parser.add_argument("--plot", type=pathlib.Path, help="also draw the curves (the plots extra)")
+    parser.add_argument("--redraw", type=pathlib.Path, help="draw this report's curves, and measure nothing")
     options = parser.parse_args(arguments)
+    if options.redraw is not None:
+        plot(json.loads(options.redraw.read_text("utf-8")), options.plot)
+        return
     config = common.chosen_config(options)
     sweeps = open_sweeps(common.data_folder("kitti_object"))
     frames = [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
@@ -168,7 +181,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         rungs = [
             {"amount": kind.amounts[s - 1], **measure(frames, copies, config, name, s)} for s in severities
         ]
-        report["corruptions"][name] = {"unit": kind.unit, "severities": rungs}
+        report["corruptions"][name] = {"severities": rungs}
         print(f"measured {name}", flush=True)
     print_report(report)
     if options.plot is not None:

@@ -187,6 +187,15 @@ def survivors_of(path: pathlib.Path) -> dict[str, frozenset[tuple[str, int]]]:
     }
 
 
+def earlier_report(path: pathlib.Path | None, modules: Sequence[str]) -> dict[str, Any]:
+    """What an earlier report of that name says of the other modules, so that they can be run one by one."""
+    if path is None or not path.is_file():
+        return {"modules": {}, "survivors": []}
+    report = json.loads(path.read_text("utf-8"))
+    kept = {module: row for module, row in report["modules"].items() if module not in modules}
+    return {"modules": kept, "survivors": [row for row in report["survivors"] if row["module"] in kept]}
+
+
 def summarise(mutants: Sequence[Mutant], available: int) -> dict[str, int]:
     """Counts by outcome."""
     outcomes = [mutant.outcome for mutant in mutants]
@@ -207,7 +216,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     again = None if options.again is None else survivors_of(options.again)
     modules = [short[name] for name in options.modules if again is None or short[name] in again]
-    report: dict[str, Any] = {"modules": {}, "survivors": []}
+    report = earlier_report(options.json, modules)
     for module in modules:
         wanted = None if again is None else again[module]
         with tempfile.TemporaryDirectory() as folder:

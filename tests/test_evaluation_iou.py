@@ -1,5 +1,7 @@
 """Overlaps of boxes: values worked by hand, and laws."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -84,3 +86,38 @@ def test_a_dimension_overlaps_by_the_shorter_over_the_longer():
     np.testing.assert_allclose(
         iou.dimension_iou(np.array([2.0, 4, 0, 0]), np.array([4.0, 2, 3, 0])), [0.5, 0.5, 0, 1]
     )
+
+
+def test_two_boxes_overlap_in_height_by_what_they_share_of_it_wherever_they_stand():
+    a = np.array([3.0, 7.0, 2.0, 4.0, 2.0, 1.0, 0.0])
+    b = np.array([3.0, 7.0, 2.5, 4.0, 2.0, 2.0, 0.0])
+    # From 1.5 to 2.5 m and from 1.5 to 3.5 m: one metre of two.
+    bev, box = iou.box_overlaps(a, b)
+    assert float(bev) == pytest.approx(1, abs=1e-6)
+    assert float(box) == pytest.approx(0.5, abs=1e-6)
+    assert float(iou.box_overlaps(b, a)[1]) == pytest.approx(0.5, abs=1e-6)
+
+
+def test_boxes_of_less_than_a_unit_overlap_like_larger_ones():
+    small = BOX * [1, 1, 1, 0.1, 0.1, 0.1, 1]
+    shifted = small + np.array([0.1 * math.cos(0.3), 0.1 * math.sin(0.3), 0, 0, 0, 0, 0])
+    bev, box = iou.pairwise_overlaps([shifted], [small])
+    # A quarter of the length of 0.4 m along it: three of five parts are shared.
+    np.testing.assert_allclose([bev, box], 0.6, atol=1e-4)
+    pixels, beside = np.array([[0.0, 0, 0.5, 0.5]]), np.array([[0.25, 0, 0.75, 0.5]])
+    np.testing.assert_allclose(iou.image_iou(pixels, beside), 1 / 3)
+    np.testing.assert_allclose(iou.image_fractions(pixels, beside), 1 / 2)
+    assert float(iou.dimension_iou(np.array(0.3), np.array(0.4))) == pytest.approx(0.75)
+
+
+def test_frames_keep_their_own_boxes():
+    rng = np.random.default_rng(0)
+    frames = [
+        (BOX + rng.normal(0, 0.5, (a, 7)), BOX + rng.normal(0, 0.5, (b, 7)))
+        for a, b in ((2, 3), (0, 4), (1, 1), (3, 2))
+    ]
+    for (bev, box), (a, b) in zip(iou.framewise_overlaps(frames), frames, strict=True):
+        assert bev.shape == box.shape == (len(a), len(b))
+        for together, alone in zip((bev, box), iou.pairwise_overlaps(a, b), strict=True):
+            np.testing.assert_array_equal(together, alone)
+    assert iou.framewise_overlaps([]) == []

@@ -227,6 +227,28 @@ def test_eager_jit_and_vmap_agree():
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=0.05), eager, other)
 
 
+def test_rank_does_not_depend_on_the_unit():
+    for scale in (1e-4, 1e4):
+        check_full_rank(scale * np.eye(3), "K")
+    with pytest.raises(ValueError, match="K has rank 2, not 3"):
+        check_full_rank(1e4 * np.diag([1.0, 1.0, 0.0]), "K")
+
+
+def test_gradients_are_finite_also_behind_the_camera_and_across_the_near_plane():
+    boxes = random_boxes(np.random.default_rng(2), 16, x=(-12.0, 12.0))
+    image = _project(*boxes, make_calibration())
+    assert not image.visible.all()
+    assert (image.corner_valid.any(-1) & ~image.corner_valid.all(-1)).any()
+
+    def total(center):
+        image = project_boxes(center, *boxes[1:], make_calibration())
+        return jnp.sum(image.boxes_px) + jnp.sum(image.visible_fraction)
+
+    gradient = jax.jit(jax.grad(total))(boxes[0])
+    assert np.isfinite(gradient).all()
+    assert np.any(gradient != 0)
+
+
 def test_no_boxes_project_to_none():
     image = _project(jnp.zeros((0, 3)), jnp.zeros((0, 3)), jnp.zeros(0), make_calibration())
     assert image.boxes_px.shape == (0, 4)

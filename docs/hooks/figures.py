@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jaxbox
+from jaxbox.evaluation.corruptions import CORRUPTIONS
 from jaxbox.types import Counts, Status
 
 RESULTS = pathlib.Path(__file__).parents[2] / "benchmarks" / "results"
@@ -164,6 +165,40 @@ def faults() -> str:
     return table(["", "count"], rows) + made_with(report)
 
 
+def corruption() -> str:
+    """Accuracy of corrupted sweeps, the clean ones first."""
+    report = load("corruption")
+    names = {"3d": "3D AP", "bev": "BEV AP", "SOFT": "SOFT", "recall": "recall"}
+    names |= {"recall at the cut": "recall at the cut", "false a frame": "false a frame"}
+    names |= {"length": "too long m", "height": "too high m"}
+    rows = [("clean", "", *(report["clean"]["mean"][n] for n in names))]
+    for name, kind in report["corruptions"].items():
+        what = CORRUPTIONS[name]
+        rows += [
+            (what.title, f"{rung['amount']:g} {what.unit}", *(rung["mean"][n] for n in names))
+            for rung in kind["severities"]
+        ]
+    return table(["", "amount", *names.values()], rows) + made_with(report)
+
+
+def mutation() -> str:
+    """Mutants by module and outcome."""
+    report = load("mutation")
+    modules = report["modules"]
+    names = list(next(iter(modules.values())))
+    rows = [(f"`{module}`", *(row[n] for n in names)) for module, row in modules.items()]
+    rows.append(("all", *(sum(row[n] for row in modules.values()) for n in names)))
+    return table(["", *names], rows) + made_with(report)
+
+
+def coverage() -> str:
+    """Lines and branches by package, those with the most uncovered first."""
+    report = load("coverage")
+    names = ("lines", "lines missed", "branches", "branches missed", "percent")
+    rows = [(f"`{part}`", *(row[n] for n in names)) for part, row in report["parts"].items()]
+    return table(["", *names], rows) + made_with(report)
+
+
 def status() -> str:
     """Every bit and its sentence."""
     bits = [bit for bit in Status if bit.value]
@@ -191,6 +226,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "peers": peers,
     "fuzz": fuzz,
     "faults": faults,
+    "corruption": corruption,
+    "mutation": mutation,
+    "coverage": coverage,
     "status": status,
     "counts": counts,
 }

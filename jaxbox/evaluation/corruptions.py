@@ -246,7 +246,7 @@ class Corruption:
 
 CORRUPTIONS: dict[str, Corruption] = {
     "beams": Corruption(
-        title="beam loss", unit="one beam kept in", none=1, amounts=(2, 3, 4, 8, 16), of_points=thin_beams
+        title="beam loss", unit="x fewer beams", none=1, amounts=(2, 3, 4, 8, 16), of_points=thin_beams
     ),
     "dropout": Corruption(
         title="lost points",
