@@ -5,6 +5,7 @@ import importlib.util
 import json
 import math
 import pathlib
+import re
 
 import jax
 import jax.numpy as jnp
@@ -187,3 +188,14 @@ def test_the_monitor_asks_for_sweeps(monitor, capsys):
     with pytest.raises(SystemExit):
         monitor.main([])
     assert "give paths, or --synthetic N" in capsys.readouterr().err
+
+
+def test_the_example_of_the_page_runs(capsys):
+    page = (EXAMPLE.parents[1] / "docs" / "reliability.md").read_text()
+    section = page[page.index("\n## Monitoring\n") :]
+    (example,) = re.findall(r"```python\n(.*?)```", section[: section.index("\n## ", 4)], re.DOTALL)
+    # A sparser sweep, whose detector is compiled already.
+    small = example.replace("seed=0", f"seed=6, num_azimuths={NUM_AZIMUTHS}")
+    assert small != example
+    exec(compile(small, "reliability.md", "exec"), {})
+    assert "'ground_points': " in capsys.readouterr().out
