@@ -29,7 +29,7 @@ TESTS: Mapping[str, str] = {
     "jaxbox/geometry.py": "tests/test_geometry.py",
     "jaxbox/evaluation/iou.py": "tests/test_evaluation_iou.py jaxbox/evaluation/iou.py",
     "jaxbox/projection.py": "tests/test_projection.py",
-    "jaxbox/descriptors.py": "tests/test_parity_boxes.py -k 'descriptors and synthetic'",
+    "jaxbox/descriptors.py": "tests/test_parity_boxes.py -k 'descriptors and not real'",
     "jaxbox/hull.py": "tests/test_parity_boxes.py -k 'hull or extreme'",
     "jaxbox/box.py": "tests/test_parity_boxes.py -k '(synthetic or direction) and not hull and not extreme'",
     "jaxbox/masked.py": "tests/test_masked.py",

@@ -180,6 +180,21 @@ def test_wrap_yaw_is_half_open_and_keeps_the_axis():
     assert float(geometry.wrap_yaw(jnp.float32(np.pi / 2))) == pytest.approx(-np.pi / 2)
 
 
+def test_wrap_yaw_beside_its_seam_is_in_range_but_for_the_last_bit():
+    seam = np.float32(np.pi * np.arange(-2, 2) + np.pi / 2)
+    yaw = [seam]
+    for direction in (-np.inf, np.inf):
+        beside = seam
+        for _ in range(6):
+            beside = np.nextafter(beside, np.float32(direction))
+            yaw.append(beside)
+    wrapped = np.asarray(jax.jit(geometry.wrap_yaw)(np.stack(yaw)))
+    half = np.float32(np.pi / 2)
+    assert wrapped.min() >= np.nextafter(-half, np.float32(-np.inf))
+    assert wrapped.max() < half
+    np.testing.assert_allclose(np.abs(wrapped), half, atol=1e-5)
+
+
 def test_rotate_is_counter_clockwise():
     np.testing.assert_allclose(geometry.rotate(jnp.array([1.0, 0.0]), jnp.pi / 2), [0, 1], atol=1e-6)
 
