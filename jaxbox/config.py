@@ -7,7 +7,7 @@ Lengths are metres, angles degrees (``_deg``), everything else unitless unless s
 
 import dataclasses
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal, TypeVar, dataclass_transform
 
 import jax
@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxbox.capacities import CAPACITY_STEP, rough_counts
 from jaxbox.class_priors import CAR, TRUCK, VAN, ClassPrior, Scalar
+from jaxbox.sensors import sensor_settings
 
 _T = TypeVar("_T")
 
@@ -381,9 +382,40 @@ class DetectorConfig:
         )
 
     @classmethod
-    def presets(cls) -> dict[str, "DetectorConfig"]:
-        """The named presets that the command line offers."""
-        return {"default": cls(), "fast": cls.fast(), "paper": cls.paper()}
+    def presets(cls, *, num_beams: int = 64) -> dict[str, "DetectorConfig"]:
+        """The named presets that the command line offers, for a sensor of so many beams."""
+        presets = {"default": cls(), "fast": cls.fast(), "paper": cls.paper()}
+        return {name: cls.for_sensor(num_beams, base=preset) for name, preset in presets.items()}
+
+    @classmethod
+    def for_sensor(cls, num_beams: int, *, base: "DetectorConfig | None" = None) -> "DetectorConfig":
+        """A preset for a sensor of fewer or more beams than the 64 that it was chosen on.
+
+        Which settings depend on the beams, and how their values were measured, is in `jaxbox.sensors`. They
+        replace those of the base; all others, and with 64 beams all, stay.
+
+        Args:
+          num_beams: 16, 32, 64 or 128; `jaxbox info FILE` says which of them sees like another sensor.
+          base: where all else comes from; None for the default preset.
+
+        Returns:
+          The settings. The maps' max_cells are static and differ, so each sensor is a compile.
+
+        Raises:
+          ValueError: for another number of beams.
+
+        >>> DetectorConfig.for_sensor(64) == DetectorConfig()
+        True
+        """
+        base = cls() if base is None else base
+        sensor = sensor_settings(num_beams)
+        stages = {
+            stage: dataclasses.replace(getattr(base, stage), **values)
+            for stage, values in sensor.changes.items()
+        }
+        config = dataclasses.replace(base, **stages)
+        cells = [_rounded_up(sensor.cells * m.max_cells) for m in config.clustering.maps]
+        return config if sensor.cells == 1 else _with_cells(config, cells)
 
     @classmethod
     def for_sweeps(
@@ -417,11 +449,22 @@ class DetectorConfig:
         if not counts:
             raise ValueError("there are no sweeps; pass at least one (n, 3) array.")
         largest = np.maximum(margin * np.max(counts, axis=0), 1)
-        obstacles, slab, *cells = (CAPACITY_STEP * math.ceil(size / CAPACITY_STEP) for size in largest)
-        maps = zip(base.clustering.maps, cells, strict=True)
-        maps = tuple(dataclasses.replace(m, max_cells=size) for m, size in maps)
+        obstacles, slab, *cells = (_rounded_up(size) for size in largest)
+        base = _with_cells(base, cells)
         return dataclasses.replace(
             base,
-            clustering=dataclasses.replace(base.clustering, maps=maps, max_obstacles=obstacles),
+            clustering=dataclasses.replace(base.clustering, max_obstacles=obstacles),
             box=dataclasses.replace(base.box, max_slab_points=slab),
         )
+
+
+def _rounded_up(size: float) -> int:
+    """A capacity of at least so many."""
+    return CAPACITY_STEP * math.ceil(size / CAPACITY_STEP)
+
+
+def _with_cells(config: DetectorConfig, cells: Sequence[int]) -> DetectorConfig:
+    """The maps with other capacities for their occupied cells."""
+    maps = zip(config.clustering.maps, cells, strict=True)
+    maps = tuple(dataclasses.replace(m, max_cells=size) for m, size in maps)
+    return dataclasses.replace(config, clustering=dataclasses.replace(config.clustering, maps=maps))

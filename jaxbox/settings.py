@@ -27,6 +27,8 @@ NO_VALUE = "none"
 """How a settings file says None, for which TOML has no word."""
 PRESET_KEY = "preset"
 """Key of a settings file that names the preset which the other keys change."""
+SENSOR_KEY = "sensor"
+"""Key of a settings file that says for how many beams the preset is to be; see `jaxbox.sensors`."""
 _TYPE_NAMES = {bool: "True or False", int: "a whole number", str: "a word", type(None): "None"}
 
 
@@ -109,7 +111,7 @@ def settings_from_toml(text: str, *, base: DetectorConfig | None = None) -> Dete
     Args:
       text: TOML; what it does not name stays as in the base.
       base: settings to start from; None for the preset that the text names under ``preset``, or else the
-        default one.
+        default one, for the number of beams that it names under ``sensor``.
 
     Returns:
       The settings.
@@ -121,27 +123,37 @@ def settings_from_toml(text: str, *, base: DetectorConfig | None = None) -> Dete
     0.2
     """
     tables = tomllib.loads(text)
-    return apply_settings(base_of(tables) if base is None else base, without_preset(tables))
+    return apply_settings(base_of(tables, preset=base), without_base(tables))
 
 
-def base_of(tables: Mapping[str, Any]) -> DetectorConfig:
-    """The preset that a parsed settings file names, or the default one.
+def base_of(
+    tables: Mapping[str, Any], *, preset: DetectorConfig | None = None, sensor: int | None = None
+) -> DetectorConfig:
+    """What the other keys of a parsed settings file change: a preset, for a sensor.
 
     Args:
       tables: of the file.
+      preset: instead of the one that the file names, or else of the default one.
+      sensor: number of beams instead of the file's; where neither says, the preset stays as it is.
 
     Returns:
-      The preset.
+      The settings.
 
     Raises:
-      ValueError: for an unknown name.
+      ValueError: for an unknown name, or a number of beams without settings.
     """
-    return preset_settings(tables.get(PRESET_KEY, "default"))
+    preset = preset_settings(tables.get(PRESET_KEY, "default")) if preset is None else preset
+    sensor = tables.get(SENSOR_KEY) if sensor is None else sensor
+    if sensor is None:
+        return preset
+    if isinstance(sensor, bool) or not isinstance(sensor, int):
+        raise ValueError(f"{SENSOR_KEY} is {sensor!r}; it must be a number of beams, such as 32.")
+    return DetectorConfig.for_sensor(sensor, base=preset)
 
 
-def without_preset(tables: Mapping[str, Any]) -> dict[str, Any]:
-    """The tables of a settings file without the preset's name."""
-    return {name: value for name, value in tables.items() if name != PRESET_KEY}
+def without_base(tables: Mapping[str, Any]) -> dict[str, Any]:
+    """The tables of a settings file without what names its base: preset and sensor."""
+    return {name: value for name, value in tables.items() if name not in (PRESET_KEY, SENSOR_KEY)}
 
 
 def preset_settings(name: Any) -> DetectorConfig:

@@ -29,6 +29,8 @@ FOUNDATION = {
     "masked",
     "grouping",
     "geometry",
+    "mounting",
+    "sensors",
 }
 STAGES = {
     "filtering", "ground", "clustering", "hull", "box", "descriptors", "evidence", "completion", "vehicles",

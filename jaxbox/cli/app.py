@@ -26,6 +26,12 @@ PresetOption = Annotated[
     str | None,
     typer.Option(help="Settings to start from: default, fast, or paper for the paper's choices."),
 ]
+SensorOption = Annotated[
+    int | None,
+    typer.Option(
+        metavar="BEAMS", help="Fit the preset to a sensor: 16, 32, 64 or 128 beams; `info FILE` says which."
+    ),
+]
 SettingsOption = Annotated[
     pathlib.Path | None,
     typer.Option(
@@ -126,6 +132,7 @@ def detect(
     *,
     output: Annotated[pathlib.Path, typer.Option(help="Folder for results and pictures.")],
     preset: PresetOption = None,
+    sensor: SensorOption = None,
     settings: SettingsOption = None,
     changes: SetOption = None,
     result_format: Annotated[
@@ -133,6 +140,13 @@ def detect(
         typer.Option("--format", help="What to write; repeatable. both: kitti and jsonl. By default kitti."),
     ] = None,
     topic: Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")] = None,
+    sensor_at: Annotated[
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="Where the sensor is in the points' frame (m), if not at 0 0 0."),
+    ] = None,
+    level: Annotated[
+        bool, typer.Option("--level", help="Measure how the sensor is tilted, and see the sweeps upright.")
+    ] = False,
     capacity: Annotated[
         int | None,
         typer.Option(min=1, help="Points a sweep is padded to; by default what it needs. One compile each."),
@@ -169,9 +183,11 @@ def detect(
     with input_errors():
         options = DetectOptions(
             output=output,
-            config=chosen_config(preset, settings, changes or []),
+            config=chosen_config(preset, settings, changes or [], sensor=sensor),
             formats=frozenset(result_format or [ResultFormat.KITTI]),
             topic=topic,
+            sensor_at=sensor_at,
+            level=level,
             capacity=capacity,
             min_score=min_score,
             points=points,
@@ -246,6 +262,7 @@ def tune(
     objective: Annotated[str, typer.Option(help=f"One of {', '.join(OBJECTIVES)}; moderate R40.")] = "soft",
     drives: DrivesOption = None,
     preset: PresetOption = None,
+    sensor: SensorOption = None,
     settings: SettingsOption = None,
     changes: SetOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Another number tries other settings.")] = 0,
@@ -262,7 +279,7 @@ def tune(
         options = TuneOptions(
             output=output,
             preset=preset or "default",
-            config=chosen_config(preset or "default", settings, changes or []),
+            config=chosen_config(preset or "default", settings, changes or [], sensor=sensor),
             search=search or [],
             trials=trials,
             refine=refine,
@@ -280,6 +297,7 @@ def export(
     output: Annotated[pathlib.Path, typer.Option(help="Folder for the files.")],
     capacity: Annotated[int, typer.Option(min=1, help="Points that a sweep is padded to.")] = 2**17,
     preset: PresetOption = None,
+    sensor: SensorOption = None,
     settings: SettingsOption = None,
     changes: SetOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the random key inside.")] = 0,
@@ -293,7 +311,7 @@ def export(
     One capacity, with its settings and random key inside. docs/export.md tells how to run it.
     """
     with input_errors():
-        config = chosen_config(preset, settings, changes or [])
+        config = chosen_config(preset, settings, changes or [], sensor=sensor)
         run_export(output, config, capacity=capacity, seed=seed, platforms=platforms or [], console=stdout())
 
 

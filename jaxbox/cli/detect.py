@@ -19,9 +19,10 @@ from jaxbox.cli.report import (
     describe_frame,
     describe_run,
 )
-from jaxbox.cli.results import ResultFormat, Results, RunAccount, written
+from jaxbox.cli.results import RUN_NAME, ResultFormat, Results, RunAccount, written
 from jaxbox.config import DetectorConfig
 from jaxbox.io.jsonl import JSONL
+from jaxbox.mounting import Mounting
 from jaxbox.workers import WorkerDied
 
 PICTURE_FOLDER = "pictures"
@@ -39,6 +40,10 @@ class DetectOptions:
     """What to write."""
     topic: str | None
     """Topic of the points in recordings."""
+    sensor_at: tuple[float, float, float] | None
+    """Where the sensor is in the frame of the points, m; None for the origin."""
+    level: bool
+    """Whether its tilt is measured, and the sweeps are seen upright."""
     capacity: int | None
     """Points a sweep is padded to, or None for what it needs."""
     min_score: float
@@ -82,7 +87,7 @@ def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
     Raises:
       InputError: where a path holds no sweeps, or the options cannot be used.
     """
-    sweeps = io.open_sweeps(paths, topic=options.topic)
+    sweeps, mounting = _mounted(io.open_sweeps(paths, topic=options.topic), options)
     with written(options.output):
         options.output.mkdir(parents=True, exist_ok=True)
     for folder in (options.output, options.output / PICTURE_FOLDER):
@@ -90,7 +95,12 @@ def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
     account = RunAccount(
         output=options.output,
         config=options.config,
-        options={"min_score": options.min_score, "capacity": options.capacity, "topic": options.topic},
+        options={
+            "min_score": options.min_score,
+            "capacity": options.capacity,
+            "topic": options.topic,
+            "T_level_points": None if mounting is None else mounting.T_level_points.round(6).tolist(),
+        },
         inputs=tuple(paths),
     )
     if options.resume:
@@ -117,6 +127,30 @@ def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
     )
     _report(run, results, options)
     return ExitCode.FRAME_FAILED if run.failures or run.interrupted else ExitCode.OK
+
+
+def _mounted(
+    sweeps: Sequence[io.Sweep], options: DetectOptions
+) -> tuple[Sequence[io.Sweep], Mounting | None]:
+    """The sweeps as seen from the sensor, upright where wanted; and how it stands, if not as usual."""
+    position = options.sensor_at or (0.0, 0.0, 0.0)
+    if options.level:
+        mounting = io.measure_sweeps(sweeps, position=position)
+        if options.speaks:
+            stdout().print(describe_mounting(mounting), markup=False)
+    elif any(position):
+        mounting = Mounting(position)
+    else:
+        return sweeps, None
+    return io.LevelSweeps(sweeps, mounting), mounting
+
+
+def describe_mounting(mounting: Mounting) -> str:
+    """A measured mounting in words."""
+    return (
+        f"the sensor stands {mounting.height_m:.2f} m above the ground, tilted {mounting.tilt_deg:.1f} "
+        f"degrees; boxes are in the level frame, see T_level_points in {RUN_NAME}"
+    )
 
 
 def _as_json(reasons: list[tuple[str, str]]) -> list[dict[str, str]]:

@@ -5,17 +5,25 @@ from collections.abc import Sequence
 
 from jaxbox.config import DetectorConfig
 from jaxbox.io import InputError, read_config
-from jaxbox.settings import parse_change, preset_settings, replace_settings
+from jaxbox.settings import base_of, parse_change, preset_settings, replace_settings
 from jaxbox.steps import check_settings
 
 
-def chosen_config(preset: str | None, file: pathlib.Path | None, changes: Sequence[str]) -> DetectorConfig:
+def chosen_config(
+    preset: str | None,
+    file: pathlib.Path | None,
+    changes: Sequence[str],
+    *,
+    sensor: int | None = None,
+) -> DetectorConfig:
     """Puts the settings together.
 
     Args:
       preset: name of the preset to start from; None for the one that the file names, or the default.
       file: settings file, TOML or JSON, or None.
       changes: each ``FIELD=VALUE``; they come last.
+      sensor: number of beams that the preset is fitted to, before the file's changes; None for the one that
+        the file names, or none.
 
     Returns:
       The settings.
@@ -28,7 +36,11 @@ def chosen_config(preset: str | None, file: pathlib.Path | None, changes: Sequen
         base = None if preset is None else preset_settings(preset)
     except ValueError as error:
         raise InputError(f"--preset {error}") from error
-    config = (base or DetectorConfig()) if file is None else read_config(file, base=base)
+    try:
+        fitted = base_of({}, preset=base, sensor=sensor)
+    except ValueError as error:
+        raise InputError(f"--sensor {error}") from error
+    config = fitted if file is None else read_config(file, base=base, sensor=sensor)
     try:
         config = replace_settings(config, dict(parse_change(change) for change in changes))
     except ValueError as error:

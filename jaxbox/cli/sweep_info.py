@@ -9,25 +9,24 @@ from rich.console import Console
 
 from jaxbox import io
 from jaxbox.config import DetectorConfig
+from jaxbox.evaluation.beams import beam_of_points, goes_beam_by_beam
+from jaxbox.mounting import MIN_SENSOR_HEIGHT_M, measure_mounting
 from jaxbox.padding import fitting_capacity
+from jaxbox.sensors import TUNED_BEAMS, fitting_sensor
 from jaxbox.settings import changed_settings
 
 NUM_BEAMS = (16, 32, 40, 64, 80, 128)
 """What spinning sensors have."""
-TUNED_BEAMS = 64
-"""The default preset was chosen on sweeps of so many beams."""
-MIN_SENSOR_HEIGHT_M = 0.7
-"""Sensors of road vehicles stand higher."""
+VEHICLE_ELEVATION_DEG = (-10.0, 0.0)
+"""Beams between these meet the vehicles: from a roof, those from 10 m on."""
+MAX_LEVEL_TILT_DEG = 3.0
+"""A sensor tilted more is better seen upright: ``python -m benchmarks.bench_mounting``."""
 _MIN_TURN_POINTS = 100
 _MAX_TURNS = 256
-_NEAR_M, _FAR_M = 3.0, 30.0
+_NEAR_M = 3.0
 _ELEVATION_STEP_DEG = 0.02
 _ELEVATION_SIGMA_STEPS = 3
 _MIN_PEAK = 0.25
-_GROUND_CELL_M = 1.0
-_NUM_PLANES = 256
-_PLANE_TOLERANCE_M = 0.1
-_MAX_PLANE_TILT = 0.3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,6 +53,8 @@ class SweepInfo:
     """0.5 % and 99.5 % of the beams' elevation."""
     num_beams: int | None
     """About how many beams the sensor has."""
+    spacing_deg: float | None
+    """Mean step in elevation between its beams below the horizon."""
     sensor_height_m: float | None
     """Of the sensor above the ground round it."""
     tilt_deg: float | None
@@ -79,7 +80,8 @@ def look_at(
     seen = xyz[finite & ~zero].astype(np.float64)
     rho = np.hypot(seen[:, 0], seen[:, 1])
     elevation = np.degrees(np.arctan2(seen[:, 2], rho))
-    plane = fit_ground(seen)
+    mounting = measure_mounting(seen)
+    num_beams, spacing_deg = estimate_beams(seen)
     some = len(seen) > 0
 
     def quantiles(values: np.ndarray, *shares: float) -> tuple[float, ...]:
@@ -95,14 +97,15 @@ def look_at(
         range_m=quantiles(rho, 0, 0.5, 1) if some else None,
         height_m=quantiles(seen[:, 2], 0.01, 0.5, 0.99) if some else None,
         elevation_deg=quantiles(elevation, 0.005, 0.995) if some else None,
-        num_beams=estimate_beams(seen),
-        sensor_height_m=None if plane is None else round(float(-plane[2]), 2),
-        tilt_deg=None if plane is None else round(float(np.degrees(np.arctan(np.hypot(*plane[:2])))), 1),
+        num_beams=num_beams,
+        spacing_deg=spacing_deg,
+        sensor_height_m=None if mounting is None else round(mounting.height_m or 0.0, 2),
+        tilt_deg=None if mounting is None else round(mounting.tilt_deg, 1),
     )
 
 
-def estimate_beams(xyz: np.ndarray) -> int | None:
-    """About how many beams made a sweep.
+def estimate_beams(xyz: np.ndarray) -> tuple[int | None, float | None]:
+    """About how many beams made a sweep, and how far apart they lie below the horizon.
 
     Files that go beam by beam show one turn of the azimuth a beam, which is counted. In others, the peaks of
     the elevations' histogram are, and the nearest number that is made is answered: that is right to a class.
@@ -111,78 +114,80 @@ def estimate_beams(xyz: np.ndarray) -> int | None:
       xyz: (n, 3) finite, m.
 
     Returns:
-      The number, or None for too few points.
+      The number, and the mean step in elevation between beams from -10 to 0 degrees; each None for too few
+      points to say.
     """
     rho = np.hypot(xyz[:, 0], xyz[:, 1])
-    turns = 1 + int(np.sum(np.abs(np.diff(np.arctan2(xyz[:, 1], xyz[:, 0]))) > np.pi))
-    if NUM_BEAMS[0] // 2 <= turns <= _MAX_TURNS and len(xyz) > _MIN_TURN_POINTS * turns:
+    elevation = np.degrees(np.arctan2(xyz[:, 2], rho))
+    beam = beam_of_points(xyz)
+    num = int(beam.max(initial=0)) + 1
+    many = len(xyz) > _MIN_TURN_POINTS * num
+    if many and NUM_BEAMS[0] // 2 <= num <= _MAX_TURNS and goes_beam_by_beam(xyz):
         # A first beam that begins at the cut itself is a turn more.
-        return min((turns - 1, turns), key=lambda n: min(abs(n - known) for known in NUM_BEAMS))
-    elevation = np.degrees(np.arctan2(xyz[:, 2], rho))[rho > _NEAR_M]
+        count = min((num - 1, num), key=lambda n: min(abs(n - known) for known in NUM_BEAMS))
+        return count, _spacing(np.array([np.median(elevation[beam == k]) for k in range(num)]))
+    elevation = elevation[rho > _NEAR_M]
     if len(elevation) < _MIN_TURN_POINTS * NUM_BEAMS[0]:
-        return None
-    low, high = np.quantile(elevation, (0.002, 0.998))
-    counts, _ = np.histogram(elevation, np.arange(low - 0.5, high + 0.5, _ELEVATION_STEP_DEG))
+        return None, None
+    peaks = _peaks(elevation)
+    return min(NUM_BEAMS, key=lambda known: abs(np.log(known / max(len(peaks), 1)))), _spacing(peaks)
+
+
+def _spacing(elevation_deg: np.ndarray) -> float | None:
+    """Mean step between beams in the part of the view that meets vehicles."""
+    low, high = VEHICLE_ELEVATION_DEG
+    met = np.sort(elevation_deg[(elevation_deg > low) & (elevation_deg < high)])
+    return round(float(np.ptp(met) / (len(met) - 1)), 3) if len(met) > 1 else None
+
+
+def _peaks(elevation_deg: np.ndarray) -> np.ndarray:
+    """Elevations at which many points lie."""
+    low, high = np.quantile(elevation_deg, (0.002, 0.998))
+    counts, edges = np.histogram(elevation_deg, np.arange(low - 0.5, high + 0.5, _ELEVATION_STEP_DEG))
     steps = np.arange(-10, 11) / _ELEVATION_SIGMA_STEPS
     window = np.exp(-(steps**2) / 2)
     smooth = np.convolve(counts, window / window.sum(), "same")
     inner = smooth[1:-1]
-    peaks = (
+    is_peak = (
         (inner > smooth[:-2]) & (inner >= smooth[2:]) & (inner > _MIN_PEAK * np.median(smooth[smooth > 0]))
     )
-    return min(NUM_BEAMS, key=lambda known: abs(np.log(known / max(peaks.sum(), 1))))
+    return edges[1:-2][is_peak] + _ELEVATION_STEP_DEG / 2
 
 
-def fit_ground(xyz: np.ndarray) -> np.ndarray | None:
-    """The plane z = a x + b y + c through most of the lowest points of 1 m cells near the sensor.
+def fitting_beams(infos: Sequence[SweepInfo]) -> int:
+    """The sensor of `jaxbox.sensors` that sees as these sweeps' does; 64 beams where that cannot be told.
 
     Args:
-      xyz: (n, 3) finite, m.
+      infos: of sweeps of one sensor.
 
     Returns:
-      (3,) a, b, c; or None where no plane has enough of them.
+      One of `jaxbox.sensors.SENSORS`.
     """
-    rho = np.hypot(xyz[:, 0], xyz[:, 1])
-    near = xyz[(rho > _NEAR_M) & (rho < _FAR_M)]
-    cells = np.floor(near[:, :2] / _GROUND_CELL_M).astype(int)
-    order = np.lexsort((near[:, 2], cells[:, 1], cells[:, 0]))
-    first = np.ones(len(order), bool)
-    first[1:] = (np.diff(cells[order], axis=0) != 0).any(axis=1)
-    lowest = near[order][first]
-    if len(lowest) < 2 * len("xyz"):
-        return None
-    ones = np.column_stack([lowest[:, :2], np.ones(len(lowest))])
-    samples = np.random.default_rng(0).integers(len(lowest), size=(_NUM_PLANES, 3))
-    regular = np.abs(np.linalg.det(ones[samples])) > 1
-    if not regular.any():
-        return None
-    planes = np.linalg.solve(ones[samples][regular], lowest[samples][regular][..., 2:])[..., 0]
-    inliers = np.abs(ones @ planes.T - lowest[:, 2:]) < _PLANE_TOLERANCE_M
-    inliers &= np.hypot(planes[:, 0], planes[:, 1]) < _MAX_PLANE_TILT
-    best = inliers[:, inliers.sum(axis=0).argmax()]
-    if best.sum() < max(len("xyz"), 0.1 * len(lowest)):
-        return None
-    return np.linalg.lstsq(ones[best], lowest[best, 2], rcond=None)[0]
+    spacings = [info.spacing_deg for info in infos if info.spacing_deg is not None]
+    return fitting_sensor(float(np.median(spacings))) if spacings else TUNED_BEAMS
 
 
-def fitting_settings(sweeps: Sequence[np.ndarray]) -> dict[str, object]:
-    """Capacities that sweeps need, as changes of the default preset: none where it holds them.
+def fitting_settings(
+    sweeps: Sequence[np.ndarray], *, base: DetectorConfig | None = None
+) -> dict[str, object]:
+    """Capacities that sweeps need, as changes of a preset: none where it holds them.
 
     Args:
       sweeps: (n, 3) each, m.
+      base: the preset for their sensor; None for the default one.
 
     Returns:
       Values by dotted name, only of those that are larger than the preset's.
     """
-    base = DetectorConfig()
+    base = DetectorConfig() if base is None else base
     capacity = fitting_capacity(max(len(xyz) for xyz in sweeps))
     usual = {
         "clustering.max_obstacles": base.clustering.max_obstacles or 3 * capacity // 4,
         "box.max_slab_points": base.box.max_slab_points or capacity // 4,
     }
     usual |= {f"clustering.maps.{i}.max_cells": m.max_cells for i, m in enumerate(base.clustering.maps)}
-    needed = changed_settings(DetectorConfig.for_sweeps(sweeps, margin=1), base)
-    proposed = changed_settings(DetectorConfig.for_sweeps(sweeps), base)
+    needed = changed_settings(DetectorConfig.for_sweeps(sweeps, base=base, margin=1), base)
+    proposed = changed_settings(DetectorConfig.for_sweeps(sweeps, base=base), base)
     return {name: proposed[name] for name, value in needed.items() if value > usual[name]}
 
 
@@ -208,22 +213,50 @@ def print_sweep_info(
         xyz, intensity = sweep.read_points()
         clouds.append(xyz)
         infos.append(look_at(sweep.name, xyz, intensity, timestamp_ns=sweep.timestamp_ns))
-    changes = fitting_settings(clouds)
+    beams = fitting_beams(infos)
+    changes = fitting_settings(clouds, base=DetectorConfig.for_sensor(beams))
     capacity = fitting_capacity(max(len(xyz) for xyz in clouds))
     if as_json:
         found = [dataclasses.asdict(info) for info in infos]
-        fits = {"preset": "default", "capacity": capacity, "settings": changes}
+        options = advised_options(infos, beams)
+        fits = {
+            "preset": "default",
+            "sensor": beams,
+            "capacity": capacity,
+            "settings": changes,
+            "options": options,
+        }
         console.out(json.dumps({"num_sweeps": len(sweeps), "sweeps": found, "fits": fits}), highlight=False)
         return
     console.print(f"{len(sweeps)} sweeps, {len(infos)} looked at", markup=False)
     for info in infos:
         for line in describe(info):
             console.print(line, markup=False)
-    console.print(f"fits: preset default, padded to {capacity} points", markup=False)
+    console.print(f"fits: preset default for {beams} beams, padded to {capacity} points", markup=False)
+    if options := advised_options(infos, beams):
+        console.print(f"  jaxbox detect ... {' '.join(options)}", markup=False)
     for name, value in changes.items():
         console.print(f"  {name} = {value}", markup=False)
     if changes:
         console.print("  (the preset's capacities are too small: put these lines in a file for --config)")
+
+
+def advised_options(infos: Sequence[SweepInfo], beams: int) -> list[str]:
+    """Options of `jaxbox detect` that fit sweeps.
+
+    Args:
+      infos: of sweeps of one sensor.
+      beams: as `fitting_beams` answers.
+
+    Returns:
+      None of them for the sensor that the presets were chosen on, mounted upright.
+    """
+    tilts = np.array([info.tilt_deg for info in infos if info.tilt_deg is not None])
+    options = [] if beams == TUNED_BEAMS else ["--sensor", str(beams)]
+    heights = [info.sensor_height_m for info in infos if info.sensor_height_m is not None]
+    low = any(height < MIN_SENSOR_HEIGHT_M for height in heights)
+    tilted = len(tilts) > 0 and np.median(tilts) > MAX_LEVEL_TILT_DEG
+    return options + (["--level"] if low or tilted else [])
 
 
 def describe(info: SweepInfo) -> list[str]:
@@ -247,6 +280,7 @@ def describe(info: SweepInfo) -> list[str]:
         f"  range {near:.1f} to {far:.1f} m, half within {middle:.1f} m; z {low:.1f} to {high:.1f} m"
     )
     beams = "too few points to count beams" if info.num_beams is None else f"about {info.num_beams} beams"
+    beams += f", {info.spacing_deg:.2f} degrees apart" if info.spacing_deg else ""
     down, up = info.elevation_deg
     lines.append(f"  {beams}, elevation {down:.1f} to {up:.1f} degrees")
     if info.sensor_height_m is None:
@@ -257,11 +291,6 @@ def describe(info: SweepInfo) -> list[str]:
     if info.sensor_height_m is not None and info.sensor_height_m < MIN_SENSOR_HEIGHT_M:
         lines.append(
             "  the origin is close to the ground: is this a vehicle's frame? The detector looks from the "
-            "origin, so subtract the sensor's position first"
-        )
-    if info.num_beams is not None and info.num_beams < TUNED_BEAMS // 2 + 1:
-        lines.append(
-            f"  the default preset was chosen on {TUNED_BEAMS} beams: expect to miss far vehicles, and lower "
-            "clustering.min_points"
+            "origin: --level lifts it to a roof's height, --sensor-at X Y Z says exactly where the sensor is"
         )
     return lines

@@ -9,6 +9,9 @@ import numpy as np
 
 _MIN_BACK_RAD = np.pi
 """The azimuth of a beam falls back by nearly a turn; by less where the sensor's noise turns it back."""
+_LARGE_STEP_RAD = 0.5
+_MAX_LARGE_SHARE = 0.05
+"""Of the steps in azimuth so many may be so large: where the view is blocked."""
 _MAX_MISSING = 0.1
 """Beams of a sensor that may leave no trace in a sweep, as a share."""
 
@@ -41,6 +44,21 @@ def beam_of_points(xyz: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(beam) if len(beam) else beam
 
 
+def goes_beam_by_beam(xyz: np.ndarray) -> bool:
+    """Whether the points of a sweep can be in the order of beams: each beside the one before.
+
+    Args:
+      xyz: (n, 3) m, sensor frame.
+
+    Returns:
+      False where more than a few steps in azimuth are large, as in a shuffled sweep.
+    """
+    finite = np.isfinite(xyz).all(axis=1)
+    azimuth = np.arctan2(xyz[finite, 1].astype(np.float64), xyz[finite, 0])
+    step = np.abs(np.angle(np.exp(1j * np.diff(azimuth))))
+    return len(step) == 0 or bool(np.mean(step > _LARGE_STEP_RAD) < _MAX_LARGE_SHARE)
+
+
 def thin_beams(xyz: np.ndarray, *, num_beams: int, keep_every: int, first: int = 0) -> np.ndarray:
     """Which points a sensor would have seen that has every second beam only, or every fourth, ...
 
@@ -68,7 +86,7 @@ def thin_beams(xyz: np.ndarray, *, num_beams: int, keep_every: int, first: int =
     beam = beam_of_points(xyz)
     found = int(beam.max(initial=-1)) + 1
     # A beam without a return leaves no trace; a first or last point beyond the cut is a beam more.
-    if len(xyz) and abs(found - num_beams) > max(1, _MAX_MISSING * num_beams):
+    if len(xyz) and (not goes_beam_by_beam(xyz) or abs(found - num_beams) > max(1, _MAX_MISSING * num_beams)):
         raise ValueError(
             f"the azimuth turns {found} times and the sensor has {num_beams} beams: the points are not in "
             "the order of beams. Take the sensor's own files, before they are sorted or moved."

@@ -23,6 +23,7 @@ from jaxbox.io.kitti import (
 from jaxbox.io.kitti_calibration import read_calibration, read_raw_calibration, write_calibration
 from jaxbox.io.labelled import LabelledBoxes
 from jaxbox.io.las import read_las
+from jaxbox.io.levelled import LevelSweeps, measure_sweeps
 from jaxbox.io.npy import read_npy, read_npz
 from jaxbox.io.nuscenes import read_nuscenes
 from jaxbox.io.pandaset import read_pandaset_boxes, read_pandaset_points
@@ -41,12 +42,14 @@ __all__ = [
     "InputError",
     "KittiObject",
     "LabelledBoxes",
+    "LevelSweeps",
     "RecordedSweeps",
     "Sweep",
     "atomic_path",
     "atomic_writer",
     "boxes_from_objects",
     "detections_record",
+    "measure_sweeps",
     "objects_from_boxes",
     "objects_from_detections",
     "open_sweeps",

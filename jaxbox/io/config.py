@@ -8,17 +8,21 @@ from typing import Any
 
 from jaxbox.config import DetectorConfig
 from jaxbox.io._files import InputError, atomic_writer, read_text, reason
-from jaxbox.settings import apply_settings, base_of, settings_to_toml, without_preset
+from jaxbox.settings import apply_settings, base_of, settings_to_toml, without_base
 
 _MAX_BYTES = 2**20
 
 
-def read_config(path: str | os.PathLike[str], *, base: DetectorConfig | None = None) -> DetectorConfig:
+def read_config(
+    path: str | os.PathLike[str], *, base: DetectorConfig | None = None, sensor: int | None = None
+) -> DetectorConfig:
     """Reads a settings file.
 
     Args:
       path: TOML, or JSON where it is named so: tables and dotted names of `jaxbox.settings`.
       base: what the file changes; None for the preset that it names under ``preset``, or the default one.
+      sensor: number of beams that this is fitted to before, see `DetectorConfig.for_sensor`; None for what
+        the file names under ``sensor``, if anything.
 
     Returns:
       The settings.
@@ -28,7 +32,7 @@ def read_config(path: str | os.PathLike[str], *, base: DetectorConfig | None = N
     """
     tables = _parse(path)
     try:
-        return apply_settings(base_of(tables) if base is None else base, without_preset(tables))
+        return apply_settings(base_of(tables, preset=base, sensor=sensor), without_base(tables))
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
 

@@ -1,0 +1,105 @@
+"""Sweeps seen upright from their sensor: points and calibration in the level frame of a mounting."""
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from typing import overload
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbox.io._files import InputError
+from jaxbox.io.points import Points
+from jaxbox.io.sweep import Sweep
+from jaxbox.mounting import Mounting, measure_mounting
+from jaxbox.types import Calibration
+
+NUM_MEASURED = 5
+"""Sweeps that a mounting is measured on, spread over all there are."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LevelSweep(Sweep):
+    """A sweep whose points, and whose camera, are moved into the level frame of its mounting."""
+
+    mounting: Mounting = dataclasses.field(default_factory=Mounting)
+    """How the sensor stands in the frame of the file."""
+
+    def read_points(self) -> Points:
+        """Reads the points; as `Sweep.read_points`, in the level frame."""
+        xyz, intensity = super().read_points()
+        return self.mounting.level(xyz), intensity
+
+    def read_calibration(self) -> Calibration | None:
+        """Reads the camera; as `Sweep.read_calibration`, seen from the level frame."""
+        calibration = super().read_calibration()
+        if calibration is None:
+            return None
+        T_rect_level = np.asarray(calibration.T_rect_velo, np.float64) @ np.linalg.inv(
+            self.mounting.T_level_points
+        )
+        return dataclasses.replace(calibration, T_rect_velo=jnp.asarray(T_rect_level, jnp.float32))
+
+
+class LevelSweeps(Sequence[LevelSweep]):
+    """Sweeps of one sensor, each in the level frame; read as the sweeps themselves are, one by one."""
+
+    def __init__(self, sweeps: Sequence[Sweep], mounting: Mounting) -> None:
+        self.mounting = mounting
+        """How the sensor stands, such as `measure_sweeps` finds."""
+        self._sweeps = sweeps
+
+    def __len__(self) -> int:
+        """As many as there were."""
+        return len(self._sweeps)
+
+    def __iter__(self) -> Iterator[LevelSweep]:
+        """One pass over the sweeps."""
+        return map(self._level, self._sweeps)
+
+    @overload
+    def __getitem__(self, index: int) -> LevelSweep: ...
+    @overload
+    def __getitem__(self, index: slice) -> tuple[LevelSweep, ...]: ...
+    def __getitem__(self, index: int | slice) -> LevelSweep | tuple[LevelSweep, ...]:
+        """A sweep by its number, or several."""
+        if isinstance(index, slice):
+            return tuple(map(self._level, self._sweeps[index]))
+        return self._level(self._sweeps[index])
+
+    def _level(self, sweep: Sweep) -> LevelSweep:
+        fields = {field.name: getattr(sweep, field.name) for field in dataclasses.fields(Sweep)}
+        return LevelSweep(**fields, mounting=self.mounting)
+
+
+def measure_sweeps(
+    sweeps: Sequence[Sweep],
+    *,
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Mounting:
+    """Measures how a sensor is mounted: the middle of a few of its sweeps, so that no bump or slope counts.
+
+    Where the ground is at the origin, the points are in a vehicle's frame: the sensor is taken to stand over
+    the origin at a roof's height. Where that is not so, say where it stands.
+
+    Args:
+      sweeps: of one sensor.
+      position: x, y, z of the sensor in the frame of the points, m.
+
+    Returns:
+      The mounting.
+
+    Raises:
+      InputError: where a sweep cannot be read, or none shows a ground.
+    """
+    # Every so many: a recording is passed once.
+    some = sweeps[:: -(-len(sweeps) // NUM_MEASURED)]
+    found = [measure_mounting(sweep.read_points()[0], position=position) for sweep in some]
+    seen = [mounting for mounting in found if mounting is not None]
+    if not seen:
+        raise InputError(
+            f"{sweeps[0].name}: no ground round the sensor in {len(some)} sweeps, so the mounting cannot be "
+            "measured. Is z up, and the position of the sensor right?"
+        )
+    up = np.median([mounting.up for mounting in seen], axis=0)
+    x, y, z = (float(value) for value in up / np.linalg.norm(up))
+    return Mounting(position, (x, y, z), float(np.median([mounting.height_m for mounting in seen]))).raised()

@@ -1,0 +1,138 @@
+"""Settings for sensors of fewer and more beams, and which of them fits a sweep."""
+
+import dataclasses
+import importlib
+import pathlib
+
+import numpy as np
+import pytest
+
+from jaxbox import DetectorConfig, io, synthetic
+from jaxbox.capacities import CAPACITY_STEP
+from jaxbox.cli import sweep_info
+from jaxbox.cli.settings import chosen_config
+from jaxbox.evaluation import thin_beams
+from jaxbox.sensors import SENSORS, fitting_sensor
+from jaxbox.settings import changed_settings, settings_from_toml
+
+
+@pytest.mark.parametrize("preset", DetectorConfig.presets())
+def test_the_presets_are_for_64_beams(preset):
+    base = DetectorConfig.presets()[preset]
+    assert DetectorConfig.for_sensor(64, base=base) == base
+    assert DetectorConfig.presets(num_beams=64)[preset] == base
+
+
+@pytest.mark.parametrize("num_beams", SENSORS)
+@pytest.mark.parametrize("preset", DetectorConfig.presets())
+def test_a_sensor_changes_what_its_table_says_and_the_maps_capacities(preset, num_beams):
+    base, sensor = DetectorConfig.presets()[preset], SENSORS[num_beams]
+    config = DetectorConfig.presets(num_beams=num_beams)[preset]
+    wanted = {
+        f"{stage}.{name}": value for stage, row in sensor.changes.items() for name, value in row.items()
+    }
+    changed = changed_settings(config, base)
+    cells = {name: value for name, value in changed.items() if name.endswith(".max_cells")}
+    assert {name: value for name, value in changed.items() if name not in cells} == wanted
+    if num_beams == 64:
+        assert not changed
+    else:
+        assert len(cells) == len(base.clustering.maps)
+        for before, after in zip(base.clustering.maps, config.clustering.maps, strict=True):
+            assert after.max_cells % CAPACITY_STEP == 0
+            assert 0 <= after.max_cells - sensor.cells * before.max_cells < CAPACITY_STEP
+
+
+def test_fewer_beams_ask_for_fewer_points_and_a_wider_ground():
+    points = [DetectorConfig.for_sensor(n).vehicles.saturation_points for n in sorted(SENSORS)]
+    assert points == sorted(points)
+    assert points[0] < points[1] < points[2]
+    smoothing = {n: DetectorConfig.for_sensor(n).ground.smoothing_m for n in SENSORS}
+    assert min(smoothing[16], smoothing[32]) > smoothing[64]
+
+
+@pytest.mark.parametrize("num_beams", [0, 63, -16])
+def test_other_numbers_of_beams_are_refused(num_beams):
+    with pytest.raises(ValueError, match="choose one of 16, 32, 64, 128"):
+        DetectorConfig.for_sensor(num_beams)
+    with pytest.raises(io.InputError, match=f"--sensor {num_beams}: "):
+        chosen_config(None, None, [], sensor=num_beams)
+
+
+def test_a_settings_file_names_its_sensor_and_the_command_line_goes_before_it(tmp_path):
+    file = tmp_path / "a.toml"
+    file.write_text('preset = "fast"\nsensor = 16\nbox.slab_max_height_m = 0.7\n')
+    fast16 = DetectorConfig.for_sensor(16, base=DetectorConfig.fast())
+    expected = dataclasses.replace(fast16, box=dataclasses.replace(fast16.box, slab_max_height_m=0.7))
+    assert io.read_config(file) == settings_from_toml(file.read_text()) == expected
+    assert chosen_config(None, file, []) == expected
+    # The file's changes come after the sensor, single changes after the file.
+    config = chosen_config("default", file, ["vehicles.top_grade=0.02"], sensor=32)
+    default32 = DetectorConfig.for_sensor(32)
+    changes = {"box.slab_max_height_m": 0.7, "vehicles.top_grade": 0.02}
+    assert changed_settings(config, default32) == changes
+    # What is written is exact: it names every value and no sensor, so that reading it changes nothing.
+    io.write_config(tmp_path / "exact.toml", config)
+    assert io.read_config(tmp_path / "exact.toml") == config
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"), [("sensor = 20", "20: "), ('sensor = "32"', "number of beams")]
+)
+def test_a_sensor_that_is_none_is_refused_by_file(text, expected, tmp_path):
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(io.InputError, match=rf"a\.toml: .*{expected}"):
+        io.read_config(tmp_path / "a.toml")
+
+
+def fits(xyz):
+    info = sweep_info.look_at("a", xyz, np.zeros(len(xyz)))
+    return info, sweep_info.fitting_beams([info])
+
+
+@pytest.mark.parametrize("num_beams", SENSORS)
+def test_info_finds_the_sensor_of_a_sweep(num_beams):
+    xyz = synthetic.make_sweep(2, num_beams=num_beams, num_azimuths=400).xyz
+    info, beams = fits(xyz)
+    assert (info.num_beams, beams) == (num_beams, num_beams)
+    options = sweep_info.advised_options([info], beams)
+    assert options == ([] if num_beams == 64 else ["--sensor", str(num_beams)])
+
+
+def test_info_finds_the_sensor_of_real_and_of_thinned_sweeps(data_root):
+    xyz, _ = io.open_sweeps(data_root / "kitti_object")[0].read_points()
+    for num_beams in (64, 32, 16):
+        keep = thin_beams(xyz, num_beams=64, keep_every=64 // num_beams)
+        info, beams = fits(xyz[keep])
+        assert (info.num_beams, beams) == (num_beams, num_beams)
+
+
+def test_what_counts_is_how_far_apart_the_beams_are():
+    # 32 beams over 40 degrees, and 64 over 13: what a 16 and a 128 of KITTI's view see.
+    assert fitting_sensor(40 / 30) == 16
+    assert fitting_sensor(13 / 63) == 128
+    assert sweep_info.fitting_beams([]) == 64
+
+
+@pytest.mark.parametrize(
+    ("pitch_deg", "up_m", "options"), [(0, 0, []), (10, 0, ["--level"]), (0, 1.73, ["--level"])]
+)
+def test_info_advises_to_level_what_is_tilted_or_seen_from_the_ground(pitch_deg, up_m, options):
+    sin, cos = np.sin(np.radians(pitch_deg)), np.cos(np.radians(pitch_deg))
+    pitch = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+    xyz = synthetic.make_sweep(2, num_azimuths=400).xyz @ pitch.T + np.array([0, 0, up_m])
+    info, _ = fits(xyz)
+    assert info.tilt_deg == pytest.approx(pitch_deg, abs=0.5)
+    assert sweep_info.advised_options([info], 64) == options
+
+
+def test_no_drive_is_both_chosen_on_and_held_out(monkeypatch):
+    monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parents[1]))
+    bench = importlib.import_module("benchmarks.bench_beams")
+    lines = [line.split() for line in bench.DRIVES_FILE.read_text().splitlines() if line[0] != "#"]
+    drives = dict(lines)
+    chosen = bench.chosen_on(drives)
+    on = {drives[name] for name in drives if chosen[name]}
+    off = {drives[name] for name in drives if not chosen[name]}
+    assert not on & off
+    assert (len(on), len(off)) == (6, 6)
