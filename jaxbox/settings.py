@@ -54,6 +54,21 @@ def traced_settings(config: DetectorConfig) -> dict[str, Any]:
     return {name: leaf.value for name, leaf in _leaves(config) if not leaf.static}
 
 
+def all_settings(config: DetectorConfig) -> dict[str, Any]:
+    """Every setting by its dotted name, the static ones too.
+
+    Args:
+      config: the settings.
+
+    Returns:
+      The values, in the order of the stages.
+
+    >>> all_settings(DetectorConfig.paper())["box.criterion"]
+    'area'
+    """
+    return {name: leaf.value for name, leaf in _leaves(config)}
+
+
 def replace_settings(config: DetectorConfig, changes: Mapping[str, Any]) -> DetectorConfig:
     """Changes settings by their dotted names.
 

@@ -7,8 +7,8 @@ from jaxbox.version import __version__
 
 PACKAGES = ("jax", "jaxlib", "numpy", "opencv-python-headless", "chex", "matplotlib", "scipy")
 """Packages that every installation has, or that common extras bring."""
-FORMAT_PACKAGES = ("pypcd4", "laspy", "pyarrow", "rosbags", "mcap", "rerun-sdk")
-"""Packages of the formats."""
+FORMAT_PACKAGES = ("pypcd4", "laspy", "pyarrow", "rosbags", "mcap", "rerun-sdk", "ray")
+"""Packages of the formats and of the cluster."""
 
 
 def versions(*, formats: bool = False) -> dict[str, str]:

@@ -11,6 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from test_cli import CAPACITY, make_small_sweep, run, write_points
 from test_io_formats import write_foxglove
+from typer.testing import CliRunner
 
 import jaxbox
 from jaxbox import io
@@ -253,7 +254,27 @@ def test_info_of_few_points_and_capacities_that_do_not_fit():
     assert sweep_info.fitting_settings([crowd])["clustering.maps.0.max_cells"] > 14336
 
 
-def test_completion_is_offered_and_help_has_examples():
+def test_help_offers_completion_and_has_examples():
     assert "--install-completion" in run("--help").stdout
     assert "Examples:" in run("detect", "--help").stdout
     assert app.registered_commands
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        ("jaxbox det", ["detect"]),
+        ("jaxbox detect --preset pa", ["paper"]),
+        ("jaxbox detect --set vehicles.ring_w", ["vehicles.ring_weight="]),
+        ("jaxbox detect --engine ", ["local", "ray"]),
+    ],
+)
+def test_the_shell_is_told_what_fits(words, expected):
+    environment = {
+        "_JAXBOX_COMPLETE": "complete_bash",
+        "COMP_WORDS": words,
+        "COMP_CWORD": str(len(words.split(" ")) - 1),
+    }
+    result = CliRunner().invoke(app, [], env=environment, prog_name="jaxbox")
+    assert result.exit_code == 0
+    assert result.stdout.split() == expected

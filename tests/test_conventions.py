@@ -47,6 +47,7 @@ ALLOWED = {
     "synthetic": FOUNDATION | {"projection"},
     **dict.fromkeys(TOOLS, FOUNDATION | STAGES | WIRING | TOOLS),
     "export": FOUNDATION | WIRING | {"io"},
+    "cluster": FOUNDATION | WIRING | MANY | {"io"},
     "tuning": FOUNDATION | WIRING | TOOLS,
     "viewer": FOUNDATION | WIRING | TOOLS,
 }
@@ -57,6 +58,7 @@ MODULES = sorted(
 )
 PUBLIC_MODULES = [
     "jaxbox",
+    "jaxbox.cluster",
     "jaxbox.io",
     "jaxbox.evaluation",
     "jaxbox.export",

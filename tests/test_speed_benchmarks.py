@@ -7,6 +7,8 @@ import pathlib
 import numpy as np
 import pytest
 
+from jaxbox.cluster import DatasetReport, PartitionReport
+
 CAR = [10.0, 2.0, 4.0, 1.8, 0.3]
 
 
@@ -99,3 +101,24 @@ def test_bits_of_a_batch_are_compared_with_each_single(benchmark):
     assert scaling.same_bits(batch, singles)
     singles[1]["a"][0] = np.nextafter(3.0, 4.0)
     assert not scaling.same_bits(batch, singles)
+
+
+def test_a_run_of_a_cluster_is_put_in_numbers_and_carried_to_an_archive(benchmark):
+    cluster = benchmark("bench_cluster")
+    common = {"key": "", "num_sweeps": 30, "num_boxes": 60, "num_bytes": 60_000, "detect_s": 1.0}
+    parts = [
+        PartitionReport(name="a", worker="n:1", seconds=2.0, compile_s=5.0, peak_mb=600, **common),
+        PartitionReport(name="b", worker="n:1", seconds=2.0, **common),
+        PartitionReport(name="c", worker="n:2", seconds=2.0, compile_s=4.0, peak_mb=700, **common),
+    ]
+    figures = cluster.summarise(DatasetReport(partitions=parts, elapsed_s=12.0), 9000)
+    assert figures["sweeps_per_second_per_worker"] == 15
+    assert figures["sweeps_per_second"] == 30
+    assert figures["waiting_for_detector_share"] == 0.5
+    assert (figures["compile_s"], figures["start_and_end_s"], figures["peak_mb_per_worker"]) == (5, 3, 700)
+    assert (figures["bytes_read_per_sweep"], figures["bytes_written_per_sweep"]) == (2000, 100)
+    million = cluster.archives(figures)["1000000"]
+    assert million["core_hours"] == pytest.approx(1e6 / 15 / 3600)
+    assert million["hours_on_1000_cores"] == pytest.approx(million["core_hours"] / 1000)
+    assert (million["terabytes_read"], million["gigabytes_written"]) == pytest.approx((0.002, 0.1))
+    assert cluster.worker_counts(6) == [1, 2, 4, 6]

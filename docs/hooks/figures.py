@@ -199,6 +199,52 @@ def coverage() -> str:
     return table(["", *names], rows) + made_with(report)
 
 
+def cluster() -> str:
+    """Rates of the workers of a cluster, by their number."""
+    if not (report := recorded("cluster")):
+        return unrecorded("bench_cluster", "cluster")
+    rows = [
+        (text, *(run[name] * scale for run in report["workers"].values()))
+        for text, name, scale in CLUSTER_ROWS
+    ]
+    rows.append(("`jaxbox.stream`: sweeps a second", *report["stream_sweeps_per_second"].values()))
+    header = [f"{number} worker{'s' * (number != '1')}" for number in report["workers"]]
+    return table(["", *header], rows) + made_with(report)
+
+
+CLUSTER_ROWS = (
+    ("sweeps a second and worker", "sweeps_per_second_per_worker", 1),
+    ("sweeps a second", "sweeps_per_second", 1),
+    ("share of the time in the detector", "waiting_for_detector_share", 1),
+    ("compiling, or loading from the cache, s", "compile_s", 1),
+    ("starting and ending Ray and the workers, s", "start_and_end_s", 1),
+    ("memory of a worker, peak, MB", "peak_mb_per_worker", 1),
+    ("read, MB a sweep", "bytes_read_per_sweep", 1e-6),
+    ("written, kB a sweep", "bytes_written_per_sweep", 1e-3),
+)
+"""Words, name in the report, and factor of the unit."""
+
+
+def archives() -> str:
+    """What archives of some sizes take."""
+    if not (report := recorded("cluster")):
+        return unrecorded("bench_cluster", "cluster")
+    rows = [(f"{int(size):,}", *row.values()) for size, row in report["archives"].items()]
+    columns = [name.replace("_", " ") for name in next(iter(report["archives"].values()))]
+    return table(["sweeps", *columns], rows)
+
+
+def recorded(name: str) -> dict[str, Any] | None:
+    """A result, or None where it was not recorded yet."""
+    return load(name) if (RESULTS / f"{name}.json").is_file() else None
+
+
+def unrecorded(benchmark: str, name: str) -> str:
+    """What stands where there is no result yet."""
+    command = f"python -m benchmarks.{benchmark} --json benchmarks/results/{name}.json"
+    return f"*Not recorded yet: `{command}`.*"
+
+
 def status() -> str:
     """Every bit and its sentence."""
     bits = [bit for bit in Status if bit.value]
@@ -229,6 +275,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "corruption": corruption,
     "mutation": mutation,
     "coverage": coverage,
+    "cluster": cluster,
+    "archives": archives,
     "status": status,
     "counts": counts,
 }

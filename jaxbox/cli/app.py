@@ -1,5 +1,6 @@
 """The seven commands and their options; the work is done in the module of each."""
 
+import enum
 import pathlib
 from typing import Annotated
 
@@ -9,11 +10,12 @@ from jaxbox.cli.cache import enable_cache
 from jaxbox.cli.console import input_errors, stdout
 from jaxbox.cli.demo import run_demo
 from jaxbox.cli.detect import DetectOptions, ResultFormat, run_detect
+from jaxbox.cli.detect_ray import RayOptions, run_detect_ray
 from jaxbox.cli.evaluate import run_eval
 from jaxbox.cli.export import Platform, run_export
 from jaxbox.cli.info import print_info
 from jaxbox.cli.report import SHOWN_MIN_SCORE
-from jaxbox.cli.settings import chosen_config
+from jaxbox.cli.settings import chosen_config, complete_preset, complete_setting
 from jaxbox.cli.sweep_info import print_sweep_info
 from jaxbox.cli.tune import TuneOptions, run_tune
 from jaxbox.cli.view import ViewOptions, run_view
@@ -24,7 +26,10 @@ from jaxbox.version import __version__
 
 PresetOption = Annotated[
     str | None,
-    typer.Option(help="Settings to start from: default, fast, or paper for the paper's choices."),
+    typer.Option(
+        help="Settings to start from: default, fast, or paper for the paper's choices.",
+        autocompletion=complete_preset,
+    ),
 ]
 SensorOption = Annotated[
     int | None,
@@ -42,11 +47,24 @@ SettingsOption = Annotated[
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="FIELD=VALUE", help="Change one setting by its name; repeatable."),
+    typer.Option(
+        "--set",
+        metavar="FIELD=VALUE",
+        help="Change one setting by its name; repeatable.",
+        autocompletion=complete_setting,
+    ),
 ]
 DrivesOption = Annotated[
     pathlib.Path | None, typer.Option(help='Text file of the drive of each frame: "frame drive" a line.')
 ]
+
+
+class Engine(enum.StrEnum):
+    """What `detect` runs on."""
+
+    LOCAL = "local"
+    RAY = "ray"
+
 
 EXIT_CODES = (
     "Exit codes: 0 all went well; 1 some sweeps failed or it was interrupted, the others are done; "
@@ -64,6 +82,8 @@ jaxbox detect 'clouds/*.pcd' --output out --format parquet --format jsonl --no-p
 jaxbox detect drive.mcap --output out --format parquet --resume
 
 jaxbox detect 'drives/**/*.bin' --output out --no-pictures --jobs 8
+
+jaxbox detect s3://bucket/drives --output s3://bucket/boxes --engine ray --address auto --resume
 
 jaxbox detect sweep.pcd --output out --config my.toml --set vehicles.min_score=0.1 --json
 
@@ -130,14 +150,19 @@ def detect(
         ),
     ],
     *,
-    output: Annotated[pathlib.Path, typer.Option(help="Folder for results and pictures.")],
+    output: Annotated[
+        str, typer.Option(metavar="FOLDER", help="For results and pictures; with ray a URL will do.")
+    ],
     preset: PresetOption = None,
     sensor: SensorOption = None,
     settings: SettingsOption = None,
     changes: SetOption = None,
     result_format: Annotated[
         list[ResultFormat] | None,
-        typer.Option("--format", help="What to write; repeatable. both: kitti and jsonl. By default kitti."),
+        typer.Option(
+            "--format",
+            help="What to write; repeatable. both: kitti and jsonl. By default kitti, or with ray parquet.",
+        ),
     ] = None,
     topic: Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")] = None,
     sensor_at: Annotated[
@@ -161,10 +186,29 @@ def detect(
         ),
     ] = 0.0,
     points: Annotated[bool, typer.Option(help="Put the points into MCAP and rerun files too.")] = True,
-    pictures: Annotated[bool, typer.Option(help="Draw pictures of each sweep.")] = True,
+    pictures: Annotated[
+        bool | None,
+        typer.Option(
+            "--pictures/--no-pictures", help="Draw pictures of each sweep. By default yes, but not with ray."
+        ),
+    ] = None,
     jobs: Annotated[
-        int, typer.Option(min=1, help="Processes that read, detect and draw; results do not depend on it.")
-    ] = 1,
+        int | None,
+        typer.Option(
+            min=1,
+            help="Processes that read, detect and draw; results do not depend on it. By default 1, or with "
+            "ray one a core.",
+        ),
+    ] = None,
+    engine: Annotated[
+        Engine, typer.Option(help="ray: workers of a Ray cluster, or of this machine; docs/cluster.md.")
+    ] = Engine.LOCAL,
+    address: Annotated[
+        str | None, typer.Option(help="Of the Ray cluster, such as auto; by default one is started here.")
+    ] = None,
+    sweeps_per_partition: Annotated[
+        int, typer.Option(min=1, help="Sweeps of each Parquet file, with ray.")
+    ] = 256,
     resume: Annotated[
         bool, typer.Option("--resume", help="Pass over sweeps whose results in OUTPUT are complete.")
     ] = False,
@@ -178,12 +222,41 @@ def detect(
     Results are OUTPUT/NAME.txt (kitti) or OUTPUT/detections.jsonl, .parquet, .mcap (for Foxglove) and .rrd
     (for rerun), pictures OUTPUT/pictures/NAME_*.png. Every file is written whole or not at all. The exact
     settings are in OUTPUT/config.toml, versions and failures in OUTPUT/run.json. A broken sweep is reported
-    and the others go on.
+    and the others go on. With --engine ray, paths and OUTPUT may be URLs, results are OUTPUT/part-*.parquet,
+    and OUTPUT/manifest.json tells what became of every sweep.
     """
     with input_errors():
+        config = chosen_config(preset, settings, changes or [], sensor=sensor)
+        if engine is Engine.RAY:
+            if level or sensor_at is not None:
+                raise InputError(
+                    "--level and --sensor-at: --engine ray takes sweeps as they are; leave these out."
+                )
+            ray_options = RayOptions(
+                output=output,
+                config=config,
+                formats=frozenset(result_format or []),
+                pictures=bool(pictures),
+                address=address,
+                jobs=jobs,
+                sweeps_per_partition=sweeps_per_partition,
+                topic=topic,
+                capacity=capacity,
+                min_score=min_score,
+                resume=resume,
+                quiet=quiet,
+                json=json,
+            )
+            raise typer.Exit(run_detect_ray(paths, ray_options))
+        if address is not None:
+            raise InputError("--address: only --engine ray has one; add it, or leave the address out.")
+        if "://" in output:
+            raise InputError(
+                f"--output {output}: only --engine ray writes to a URL; add it, or give a folder."
+            )
         options = DetectOptions(
-            output=output,
-            config=chosen_config(preset, settings, changes or [], sensor=sensor),
+            output=pathlib.Path(output),
+            config=config,
             formats=frozenset(result_format or [ResultFormat.KITTI]),
             topic=topic,
             sensor_at=sensor_at,
@@ -191,8 +264,8 @@ def detect(
             capacity=capacity,
             min_score=min_score,
             points=points,
-            pictures=pictures,
-            jobs=jobs,
+            pictures=True if pictures is None else pictures,
+            jobs=jobs or 1,
             resume=resume,
             quiet=quiet,
             json=json,

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from jaxbox.config import DetectorConfig
 from jaxbox.io import InputError, read_config
-from jaxbox.settings import base_of, parse_change, preset_settings, replace_settings
+from jaxbox.settings import all_settings, base_of, parse_change, preset_settings, replace_settings
 from jaxbox.steps import check_settings
 
 
@@ -50,3 +50,21 @@ def chosen_config(
     except ValueError as error:
         raise InputError(str(error)) from error
     return config
+
+
+def complete_preset(incomplete: str) -> list[str]:
+    """Presets that a shell proposes.
+
+    >>> complete_preset("pa")
+    ['paper']
+    """
+    return [name for name in DetectorConfig.presets() if name.startswith(incomplete)]
+
+
+def complete_setting(incomplete: str) -> list[str]:
+    """Settings that a shell proposes, up to where the value is to be typed.
+
+    >>> complete_setting("ground.tol")
+    ['ground.tolerance_m=']
+    """
+    return [f"{name}=" for name in all_settings(DetectorConfig()) if name.startswith(incomplete)]

@@ -30,12 +30,15 @@ _BATCH_ROWS = 16384
 
 
 @contextlib.contextmanager
-def open_parquet(path: pathlib.Path, resume: bool = False) -> Iterator[WriteResult]:
+def open_parquet(
+    path: pathlib.Path, resume: bool = False, *, metadata: Mapping[str, str] | None = None
+) -> Iterator[WriteResult]:
     """Opens a Parquet file for the boxes of a run; see the module for its columns.
 
     Args:
       path: the file; its folder is made where it is missing.
       resume: whether the rows of an earlier file of that name come first.
+      metadata: more of the file's metadata, taken when it ends.
 
     Yields:
       What adds a sweep. Rows are held until there are enough for a batch.
@@ -66,7 +69,7 @@ def open_parquet(path: pathlib.Path, resume: bool = False) -> Iterator[WriteResu
 
         yield write
         flush()
-        writer.add_key_value_metadata({SWEEPS_KEY: json.dumps(names)})
+        writer.add_key_value_metadata({SWEEPS_KEY: json.dumps(names), **(metadata or {})})
 
 
 def _copy(path: pathlib.Path, writer: Any) -> None:

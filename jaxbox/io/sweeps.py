@@ -86,6 +86,21 @@ def open_sweeps(path: PathLike | Sequence[PathLike], *, topic: str | None = None
     return parts[0] if len(parts) == 1 else _Chain(parts)
 
 
+def sweep_of(file: pathlib.Path) -> Sweep:
+    """The sweep of one point file: its name, its time and what belongs to it follow from its path.
+
+    Args:
+      file: of any of the layouts; it need not be there.
+
+    Returns:
+      The sweep.
+
+    >>> sweep_of(pathlib.Path("training/velodyne/0000/000001.bin")).name
+    '0000_000001'
+    """
+    return _sweep_at(file)
+
+
 def _expand(path: PathLike) -> list[pathlib.Path]:
     """The paths that a pattern matches, or the path itself."""
     # Not `resolve`: datasets are often put together from links, and the layout is in the links' names.
@@ -163,14 +178,15 @@ class _Chain(Sequence[Sweep]):
     def __init__(self, parts: Sequence[Sequence[Sweep]]) -> None:
         recordings = [part.path for part in parts if isinstance(part, RecordedSweeps)]
         _check_distinct([path.stem for path in recordings], recordings)
-        self._parts = parts
+        self.parts = parts
+        """The recordings, and the files as tuples."""
         self._ends = list(itertools.accumulate(len(part) for part in parts))
 
     def __len__(self) -> int:
         return self._ends[-1]
 
     def __iter__(self) -> Iterator[Sweep]:
-        return itertools.chain.from_iterable(self._parts)
+        return itertools.chain.from_iterable(self.parts)
 
     @overload
     def __getitem__(self, index: int) -> Sweep: ...
@@ -180,7 +196,7 @@ class _Chain(Sequence[Sweep]):
         wanted = range(len(self))[index]
         if isinstance(wanted, int):
             part = bisect.bisect_right(self._ends, wanted)
-            return self._parts[part][wanted - (self._ends[part - 1] if part else 0)]
+            return self.parts[part][wanted - (self._ends[part - 1] if part else 0)]
         return tuple(self[i] for i in wanted)
 
 

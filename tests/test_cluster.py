@@ -1,0 +1,428 @@
+"""A whole archive: listing, partitions that are whole or absent, workers that die; a local Ray of two."""
+
+import collections
+import functools
+import http.server
+import json
+import os
+import pathlib
+import pickle
+import shutil
+import signal
+import sys
+import threading
+import zipfile
+
+import fsspec
+import jax
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from test_cli import make_small_sweep, run, write_points
+from test_io_formats import write_foxglove
+
+from jaxbox import io
+from jaxbox.cli import cache, detect_ray
+from jaxbox.cluster import (
+    ClusterError,
+    DatasetReport,
+    PartitionReport,
+    dataset,
+    detect_dataset,
+    sources,
+    worker,
+)
+from jaxbox.cluster.sources import SweepReader, SweepRef, list_sweeps
+from jaxbox.cluster.store import Store
+from jaxbox.cluster.worker import Attempt, Partition, PartitionWorker, Task
+from jaxbox.config import DetectorConfig
+from jaxbox.io.parquet import PARQUET_COLUMNS
+from jaxbox.versions import versions
+
+# Ray Data's settings warn of their own old names.
+pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:ray")
+
+NAMES = ["000", "001", "002", "003", "004", "005"]
+BROKEN = "003"
+KILLED_AT = "005"
+SETTINGS = ("--preset", "paper", "--min-score", "0.05")
+
+
+@pytest.fixture(autouse=True)
+def _own_environment(monkeypatch):
+    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
+    # What the workers set for themselves, and that is put back here.
+    monkeypatch.setenv("NPROC", os.environ.get("NPROC", "1"))
+    monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+
+
+@pytest.fixture(scope="module")
+def archive(tmp_path_factory):
+    """Six streets in folders of two; the points of one were cut short."""
+    root = tmp_path_factory.mktemp("archive")
+    for number, name in enumerate(NAMES):
+        write_points(root / f"drive_{number // 2}" / f"{name}.bin", make_small_sweep(number % 3))
+    (root / "drive_1" / f"{BROKEN}.bin").write_bytes(b"\0" * 17)
+    return root
+
+
+def rows_of(folder):
+    """The boxes of all files of a folder, in the order of their names."""
+    tables = [pq.read_table(path) for path in sorted(folder.glob("*.parquet"))]
+    return pa.concat_tables(tables).replace_schema_metadata(None)
+
+
+@pytest.fixture(scope="module")
+def local(archive, tmp_path_factory):
+    """What one process writes."""
+    output = tmp_path_factory.mktemp("local")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(cache.CACHE_VARIABLE, "")
+        paths = [str(path) for path in sorted(archive.iterdir())]
+        result = run("detect", *paths, "--output", output, *SETTINGS, "--format", "parquet", "--no-pictures")
+    assert result.exit_code == 1
+    table = rows_of(output)
+    assert table.column_names == list(PARQUET_COLUMNS)
+    assert len(table) > 10
+    return table
+
+
+# --- where sweeps lie -----------------------------------------------------------------------------
+
+
+def serially(function, arguments):
+    return [function(argument) for argument in arguments]
+
+
+def test_sweeps_of_a_url_have_the_names_and_points_of_local_ones(archive, tmp_path):
+    shutil.copytree(archive / "drive_0", tmp_path / "training" / "velodyne" / "0007")
+    shutil.copytree(archive / "drive_2", tmp_path / "training" / "velodyne" / "0008")
+    with zipfile.ZipFile(tmp_path / "archive.zip", "w") as archived:
+        for path in sorted((tmp_path / "training").rglob("*.bin")):
+            archived.write(path, path.relative_to(tmp_path))
+        archived.writestr("training/calib/0007.txt", "P2: 1 2 3")
+        archived.writestr("training/velodyne/0008/.hidden.bin", "")
+    expected = list_sweeps([str(tmp_path / "training")], None, serially)
+    assert [ref.name for ref in expected] == ["0007_000000", "0007_000001", "0008_000004", "0008_000005"]
+    assert [ref.name for ref in expected] == [sweep.name for sweep in io.open_sweeps(tmp_path / "training")]
+    found = list_sweeps([f"zip://training::{tmp_path}/archive.zip"], None, serially)
+    assert [ref.name for ref in found] == [ref.name for ref in expected]
+    assert list_sweeps([f"zip://*/*/0007/*.bin::{tmp_path}/archive.zip"], None, serially) == found[:2]
+    reader = SweepReader(None)
+    for here, there in zip(expected, found, strict=True):
+        np.testing.assert_array_equal(reader.read(here).points[0], reader.read(there).points[0])
+        assert reader.read(here).num_bytes == reader.read(there).num_bytes > 0
+
+
+def test_times_and_poses_beside_the_points_are_fetched_with_them():
+    memory = fsspec.filesystem("memory")
+    points = np.zeros((2, 4), "<f4").tobytes()
+    memory.pipe("/day/drive/velodyne_points/data/0000000001.bin", points)
+    memory.pipe("/day/drive/velodyne_points/timestamps.txt", b"1970-01-01 00:00:01\n1970-01-01 00:00:02\n")
+    (ref,) = list_sweeps(["memory://day"], None, serially)
+    assert ref.name == "drive_0000000001"
+    assert SweepReader(None).read(ref).timestamp_ns == 2 * 10**9
+    assert sources._companion(pathlib.Path("a/sensors/lidar/1.feather")) == (
+        3,
+        "calibration/egovehicle_SE3_sensor.feather",
+    )
+    memory.rm("/day", recursive=True)
+
+
+def test_same_names_get_their_folder_and_what_is_no_sweep_is_refused(tmp_path):
+    memory = fsspec.filesystem("memory")
+    for name in ("a/x/1.bin", "a/y/1.bin", "a/y/2.bin", "b/y/1.bin", "c/notes.md"):
+        memory.pipe(f"/{name}", b"")
+    names = [ref.name for ref in list_sweeps(["memory://a"], None, serially)]
+    assert names == ["x_1", "y_1", "2"]
+    with pytest.raises(io.InputError, match="would be named y_1"):
+        list_sweeps(["memory://a", "memory://b"], None, serially)
+    with pytest.raises(io.InputError, match="memory://c: no points there"):
+        list_sweeps(["memory://c"], None, serially)
+    with pytest.raises(io.InputError, match="nosuch://a: cannot be opened"):
+        list_sweeps(["nosuch://a"], None, serially)
+    memory.pipe("/d/1.bin", b"\0" * 17)
+    with pytest.raises(io.InputError, match=r"^memory:///?d/1\.bin: 17 bytes"):
+        SweepReader(None).read(SweepRef("1", "memory://d/1.bin"))
+    for folder in "abcd":
+        memory.rm(f"/{folder}", recursive=True)
+
+
+def test_messages_of_a_recording_are_read_by_number_in_one_pass(tmp_path, monkeypatch):
+    write_foxglove(tmp_path / "drive.mcap", ["/front", "/rear"])
+    refs = list_sweeps([str(tmp_path / "drive.mcap")], "/front", serially)
+    sweeps = list(io.open_sweeps(tmp_path / "drive.mcap", topic="/front"))
+    assert [ref.name for ref in refs] == [sweep.name for sweep in sweeps]
+    passes = []
+    opened = io.open_sweeps
+    monkeypatch.setattr(io, "open_sweeps", lambda *a, **o: passes.append(a) or opened(*a, **o))
+    reader = SweepReader("/front")
+    for ref, sweep in zip(refs, sweeps, strict=True):
+        read = reader.read(ref)
+        np.testing.assert_array_equal(read.points[0], sweep.read_points()[0])
+        assert read.timestamp_ns == sweep.timestamp_ns
+    assert len(passes) == 1
+    with pytest.raises(io.InputError, match="ends before its message 9"):
+        reader.read(SweepRef("x", refs[0].url, 9))
+    assert reader.read(refs[1]).timestamp_ns == sweeps[1].timestamp_ns
+
+
+# --- partitions -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("url", ["{tmp}/out", "memory://store"])
+def test_a_file_of_a_store_is_whole_or_absent(tmp_path, url):
+    store = pickle.loads(pickle.dumps(Store(url.format(tmp=tmp_path))))
+    assert store.names() == []
+    store.make()
+    store.write_text("a.txt", "one")
+    store.write_text("a.txt", "two")
+    assert (store.read_text("a.txt"), store.read_text("b.txt"), store.names()) == ("two", None, ["a.txt"])
+    with pytest.raises(TypeError), store.writing("a.txt") as path, path.open("w") as file:
+        file.write("half") + file.write(None)
+    with pytest.raises(FileNotFoundError), store.writing("b.txt"):
+        pass
+    assert (store.read_text("a.txt"), store.names()) == ("two", ["a.txt"])
+    store.remove("a.txt")
+    store.remove("a.txt")
+    assert store.names() == []
+
+
+def test_a_store_that_cannot_be_renamed_in_leaves_nothing(tmp_path, monkeypatch):
+    store = Store(tmp_path / "out")
+    store.make()
+    monkeypatch.setattr(store._system, "mv", _fail)
+    with pytest.raises(OSError, match="disk"), store.writing("a.txt") as path:
+        path.write_text("whole")
+    assert store.names() == []
+
+
+def _fail(*_, **__):
+    raise OSError("the disk is full")
+
+
+def task_for(output, **changes):
+    fields = {
+        "config": DetectorConfig.paper(), "capacity": None, "min_score": 0.05, "topic": None, "batch": 4,
+        "num_threads": 1, "versions": versions(),
+        "cache_folder": jax.config.values["jax_compilation_cache_dir"],
+    }  # fmt: skip
+    return Task(output=str(output), **{**fields, **changes})
+
+
+def partition_of(archive):
+    paths = sorted(archive.rglob("*.bin"))
+    refs = tuple(SweepRef(path.stem, str(path)) for path in paths)
+    return Partition(name="part-000000", key="k", refs=refs)
+
+
+def test_a_worker_writes_the_rows_of_the_local_run_and_its_report_is_in_the_file(archive, local, tmp_path):
+    report = PartitionWorker(task_for(tmp_path)).work(partition_of(archive))
+    assert rows_of(tmp_path).equals(local)
+    assert (report.error, report.num_done, report.num_boxes) == (None, 5, len(local))
+    assert [item["sweep"] for item in report.failures] == [BROKEN]
+    assert report.num_bytes == sum(path.stat().st_size for path in archive.rglob("*.bin")) - 17
+    assert report.num_deaths == 0
+    metadata = pq.read_metadata(tmp_path / "part-000000.parquet").metadata
+    assert json.loads(metadata[b"jaxbox.sweeps"]) == [name for name in NAMES if name != BROKEN]
+    assert PartitionReport.from_json(metadata[worker.REPORT_KEY.encode()]) == report
+    assert [path.name for path in tmp_path.iterdir()] == ["part-000000.parquet"]
+
+
+def test_after_a_death_each_sweep_goes_alone_and_one_that_kills_again_is_given_up(archive, local, tmp_path):
+    store = Store(tmp_path)
+    assert not Attempt(store, "part-000000").careful
+    # What attempts leave whose workers died: the first in a batch, and two with a sweep alone.
+    for number in (1, 2):
+        attempt = Attempt(store, "part-000000")
+        assert (attempt.careful, attempt.num_before) == (True, number)
+        assert not attempt.gives_up(KILLED_AT)
+        attempt.begin(KILLED_AT)
+    report = PartitionWorker(task_for(tmp_path)).work(partition_of(archive))
+    assert report.num_deaths == 3
+    assert [item["sweep"] for item in report.failures] == [BROKEN, KILLED_AT]
+    assert "died 2 times" in report.failures[1]["reason"]
+    kept = [name != KILLED_AT for name in local["sweep"].to_pylist()]
+    assert rows_of(tmp_path).equals(local.filter(kept))
+    assert store.names() == ["part-000000.parquet"]
+
+
+def test_a_partition_that_cannot_be_written_is_reported_and_absent(archive, tmp_path, monkeypatch):
+    monkeypatch.setattr(worker, "open_parquet", _fail)
+    report = PartitionWorker(task_for(tmp_path)).work(partition_of(archive))
+    assert (report.error, report.num_done) == ("OSError: the disk is full", 0)
+    assert list(tmp_path.glob("*.parquet")) == []
+    other = {**versions(), "jax": "0.0.1"}
+    report = PartitionWorker(task_for(tmp_path, versions=other)).work(partition_of(archive))
+    assert f"the worker has jax {jax.__version__} for 0.0.1" in report.error
+
+
+# --- Ray ------------------------------------------------------------------------------------------
+
+
+class Server(http.server.ThreadingHTTPServer):
+    """The archive over HTTP; `before` is called with each path that is asked for."""
+
+    def __init__(self, folder):
+        self.before, self.asked = lambda path: None, collections.Counter()
+        super().__init__(("127.0.0.1", 0), functools.partial(Handler, directory=folder))
+
+
+class Handler(http.server.SimpleHTTPRequestHandler):
+    def do_GET(self):
+        self.server.asked[self.path] += 1
+        self.server.before(self.path)
+        super().do_GET()
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture(scope="module")
+def served(archive, tmp_path_factory):
+    """A copy of the archive, and its server."""
+    folder = tmp_path_factory.mktemp("served") / "archive"
+    shutil.copytree(archive, folder)
+    with Server(folder.parent) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield folder, server
+        server.shutdown()
+
+
+@pytest.fixture(scope="module")
+def ray():
+    """A local Ray of two cores, for all tests of this module."""
+    with dataset._ray(None, 2, 1) as started:
+        yield started
+
+
+def manifest_of(output):
+    return json.loads((output / dataset.MANIFEST).read_text())
+
+
+def kill_worker_of(output, partition):
+    """Sends SIGKILL to the worker that has begun a partition."""
+    os.kill(json.loads((output / f".{partition}.attempt.json").read_text())["pid"], signal.SIGKILL)
+
+
+def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_process(
+    ray, served, local, tmp_path, monkeypatch
+):
+    folder, server = served
+    url = f"http://127.0.0.1:{server.server_port}/archive"
+    command = ("detect", url, "--output", tmp_path, *SETTINGS, "--engine", "ray", "--jobs", "2")
+    command += ("--sweeps-per-partition", "2", "--json")
+
+    # Ctrl-C after the first partition.
+    with monkeypatch.context() as patch:
+        patch.setattr(detect_ray, "_tell", _interrupt)
+        result = run(*command)
+    assert result.exit_code == 1, result.output
+    assert "--resume goes on" in result.stderr
+    manifest = manifest_of(tmp_path)
+    assert (manifest["finished"], manifest["interrupted"], len(manifest["partitions"])) == (False, True, 1)
+    assert run(*command).exit_code == 2, "an output that is not empty is not written over"
+
+    # A worker is killed in the middle of a partition, and another has a broken sweep.
+    target = f"/archive/drive_2/{KILLED_AT}.bin"
+    for path in tmp_path.glob("part-000002*"):
+        path.unlink()
+    killed = []
+
+    def kill_once(path):
+        if path == target and not killed:
+            killed.append(path)
+            kill_worker_of(tmp_path, "part-000002")
+
+    server.before = kill_once
+    server.asked.clear()
+    result = run(*command, "--resume")
+    assert result.exit_code == 1, result.output
+    assert killed
+    assert server.asked[target] == 2, "and is read again by the worker that took its place"
+    assert rows_of(tmp_path).equals(local)
+    manifest = manifest_of(tmp_path)
+    assert (manifest["num_done"], manifest["num_failed"], manifest["num_boxes"]) == (5, 1, len(local))
+    assert manifest["deaths"] == {"part-000002": 1}
+    assert "part-000002: 1 workers died on it" in result.stderr
+    (failure,) = manifest["failures"]
+    assert failure["url"] == f"{url}/drive_1/{BROKEN}.bin"
+    assert failure["reason"].startswith(f"{failure['url']}: 17 bytes is no multiple of 16")
+    summary = json.loads(result.stdout.splitlines()[-1])["summary"]
+    assert summary["done"] == 5
+    assert summary["repeated"] == [{"partition": "part-000002", "deaths": 1}]
+    assert [path.name for path in sorted(tmp_path.iterdir())] == [
+        "config.toml", "manifest.json", "part-000000.parquet", "part-000001.parquet", "part-000002.parquet",
+    ]  # fmt: skip
+
+    # The sweep is mended, and only its partition is done again.
+    server.asked.clear()
+    before = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.parquet")}
+    shutil.copy(folder / "drive_0" / "000.bin", folder / "drive_1" / f"{BROKEN}.bin")
+    result = run(*command, "--resume", "--quiet")
+    assert result.exit_code == 0, result.output
+    changed = [name for name, time in before.items() if (tmp_path / name).stat().st_mtime_ns != time]
+    assert changed == ["part-000001.parquet"]
+    assert [path for path in server.asked if path.endswith(".bin") and "drive_1" not in path] == []
+    manifest = manifest_of(tmp_path)
+    assert (manifest["finished"], manifest["num_done"], manifest["num_skipped"]) == (True, 6, 2)
+    assert sum(len(part["status"]) for part in manifest["partitions"]) == 6
+    assert manifest["versions"]["jax"] == jax.__version__
+    config = io.read_config(tmp_path / "config.toml")
+    assert config == DetectorConfig.paper()
+
+    # Other settings, and other partitions, are not mixed with these.
+    result = run(*command, "--resume", "--set", "vehicles.max_overlap=0.11", "--capacity", "20000")
+    assert result.exit_code == 2
+    assert "vehicles.max_overlap, capacity differ" in result.stderr.replace("\n", "")
+    result = run(*command, "--resume", "--sweeps-per-partition", "4")
+    assert result.exit_code == 2
+    assert "part-000002.parquet belongs to" in result.stderr.replace("\n", "")
+
+
+def _interrupt(*_):
+    raise KeyboardInterrupt
+
+
+def test_what_the_workers_cannot_do_is_refused(tmp_path):
+    common = ("detect", tmp_path, "--output", tmp_path / "out")
+    for arguments, expected in (
+        (("--engine", "ray", "--format", "kitti"), "write parquet"),
+        (("--engine", "ray", "--pictures"), "draw none"),
+        (("--address", "auto"), "only --engine ray"),
+        (("--output", "s3://bucket/out"), "only --engine ray"),
+    ):
+        result = run(*common, *arguments)
+        assert result.exit_code == 2, result.output
+        assert expected in result.stderr
+    with pytest.raises(ValueError, match="sweeps_per_partition is 0"):
+        detect_dataset(tmp_path, tmp_path / "out", sweeps_per_partition=0)
+
+
+def test_without_ray_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    result = run("detect", tmp_path, "--output", tmp_path / "out", "--engine", "ray")
+    assert result.exit_code == 2
+    assert "pip install 'jaxbox[ray]'" in result.stderr
+
+
+def test_where_ray_gives_up_the_command_says_so(tmp_path, monkeypatch):
+    monkeypatch.setattr(detect_ray, "detect_dataset", _give_up)
+    result = run("detect", tmp_path, "--output", tmp_path / "out", "--engine", "ray")
+    assert result.exit_code == 1
+    assert "no node is left. The partitions that are done stay" in result.stderr.replace("\n", " ")
+
+
+def _give_up(*_, **__):
+    raise ClusterError("no node is left.")
+
+
+def test_the_report_counts_lost_partitions_among_the_failures():
+    lost = PartitionReport(name="part-000001", key="", num_sweeps=2, error="OSError: full")
+    done = PartitionReport(name="part-000000", key="", num_sweeps=2, status={"a": 0, "b": 4}, num_deaths=2)
+    report = DatasetReport(partitions=[done, lost])
+    assert report.failures == [{"sweep": "part-000001", "url": "", "reason": "OSError: full"}]
+    assert (report.num_done, report.deaths) == (2, {"part-000000": 2})
+    with pytest.raises(ValueError, match="not the report"):
+        PartitionReport.from_json('{"name": "a"}')
