@@ -260,6 +260,37 @@ def counts() -> str:
     return table(["count", ""], rows)
 
 
+def bad_input() -> str:
+    """Every bad input, and what both presets make of it."""
+    report = load("bad_input")
+    rows = []
+    for group, inputs in report["answers"].items():
+        rows.append((f"**{group}**", *[""] * 6))
+        for name, answers in inputs.items():
+            cells = [cell for preset in ("default", "paper") for cell in bad_input_cells(answers[preset])]
+            laws = all(not answer["broken"] for answer in answers.values())
+            rows.append((name, f"{answers['default']['points']:,}", *cells, "held" if laws else "broken"))
+    names = ["status", "boxes, above the cut"]
+    header = [
+        "input",
+        "points",
+        *(f"{preset}: {n}" for preset in ("default", "paper") for n in names),
+        "laws",
+    ]
+    return table(header, rows) + made_with(report)
+
+
+def bad_input_cells(answer: dict[str, Any]) -> list[str]:
+    """The status, and how many boxes there were and were worth acting on."""
+    status = ", ".join(f"`{bit}`" for bit in answer["status"]) or "OK"
+    return [status, f"{answer['boxes']}, {answer['boxes_above_cut']}"]
+
+
+def refused() -> str:
+    """The error of every input that is refused."""
+    return table(["input", "`ValueError`"], load("bad_input")["refused"].items())
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "accuracy": accuracy,
     "sizes": sizes,
@@ -279,4 +310,6 @@ TABLES: dict[str, Callable[[], str]] = {
     "archives": archives,
     "status": status,
     "counts": counts,
+    "bad_input": bad_input,
+    "refused": refused,
 }

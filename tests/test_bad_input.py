@@ -1,0 +1,84 @@
+"""Bad input: no exception, finite answers, the right bits, every point in its place, and no box from nothing.
+
+The inputs and the laws are in `benchmarks.bad_input`, from which the documentation's table is made too.
+"""
+
+import functools
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks import bad_input, bench_bad_input, common
+from jaxbox import DetectorConfig, PointCloud, Status, detect
+
+CASES = {case.name: case for case in bad_input.CASES}
+HERE = [case.name for case in bad_input.CASES if not case.compiles_anew]
+"""The others compile the whole detector anew, and are run by `bench_bad_input`."""
+
+
+@functools.cache
+def answer(name, preset):
+    """What a preset makes of a case: the points that went in, and the detections."""
+    xyz, cloud = bad_input.pad(CASES[name])
+    return xyz, jax.device_get(detect(cloud, DetectorConfig.presets()[preset]))
+
+
+@pytest.mark.parametrize("preset", bad_input.PRESETS)
+@pytest.mark.parametrize("name", HERE)
+def test_bad_input_has_a_lawful_answer_with_the_right_status(name, preset):
+    case, (xyz, detections) = CASES[name], answer(name, preset)
+    config = DetectorConfig.presets()[preset]
+    assert bad_input.broken_laws(detections, xyz, case.capacity, config) == []
+    assert Status(int(detections.status)) == case.status[preset]
+    assert detections.score.max() <= case.best_score
+    if case.same_as:
+        same, _ = jax.tree.flatten(answer(case.same_as, preset)[1])
+        for leaf, expected in zip(jax.tree.leaves(detections), same, strict=True):
+            np.testing.assert_array_equal(leaf, expected)
+
+
+@pytest.mark.parametrize("name", [case.name for case in bad_input.STORAGE])
+def test_the_same_numbers_give_the_same_cloud_however_they_are_stored(name):
+    _, found = bad_input.pad(CASES[name])
+    _, expected = bad_input.pad(bad_input.STREET)
+    assert found.xyz1.dtype == np.float32
+    np.testing.assert_array_equal(found.xyz1, expected.xyz1)
+
+
+@pytest.mark.parametrize("name", bad_input.REFUSED)
+def test_bad_points_are_refused_saying_what_is_wrong_and_how_to_mend_it(name):
+    arguments, options, message = bad_input.REFUSED[name]
+    with pytest.raises(ValueError, match=message):
+        PointCloud.from_numpy(*arguments, **options)
+
+
+def test_a_box_from_nothing_and_a_lost_point_are_noticed():
+    """The laws bite: answers that break them are told."""
+    config = DetectorConfig()
+    xyz, detections = answer(bad_input.STREET.name, "default")
+    laws = functools.partial(bad_input.broken_laws, capacity=bad_input.CAPACITY, config=config)
+    moved = jax.tree.map(np.copy, detections)
+    moved.center[0] += [0, 0, 50]
+    assert laws(moved, xyz) == ["every box is supported by points of the input"]
+    assert laws(detections, xyz[1:]) == ["every point of the input is in exactly one place"]
+    wrong = jax.tree.map(np.copy, detections)
+    wrong.yaw[0] = np.nan
+    wrong.score[1] = 2
+    assert {"every number is finite", "the best score comes first"} <= set(laws(wrong, xyz))
+
+
+def test_the_recorded_table_holds_every_case_and_no_broken_law():
+    recorded = json.loads((common.PROJECT / "benchmarks" / "results" / "bad_input.json").read_text())
+    answers = recorded["answers"]
+    assert {group: list(cases) for group, cases in answers.items()} == {
+        group: [case.name for case in cases] for group, cases in bad_input.GROUPS.items()
+    }
+    for group, cases in bad_input.GROUPS.items():
+        for case in cases:
+            for preset in bad_input.PRESETS:
+                row = answers[group][case.name][preset]
+                assert row["broken"] == []
+                assert row["status"] == common.status_names([int(case.status[preset])])
+    assert recorded["refused"] == bench_bad_input.refusals()
