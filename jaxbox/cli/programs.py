@@ -14,7 +14,7 @@ from typing import Any
 
 import jax
 import jax.export
-import jaxlib
+import jaxlib.version
 import numpy as np
 
 import jaxbox
@@ -96,7 +96,7 @@ def _fingerprint(settings: Any, capacity: int) -> str:
     device = jax.devices()[0]
     made_of = (
         _source_digest(),
-        (jax.__version__, jaxlib.__version__, jax.config.values["jax_default_prng_impl"]),
+        (jax.__version__, jaxlib.version.__version__, jax.config.values["jax_default_prng_impl"]),
         (device.platform, device.device_kind),
         (capacity, str(settings)),
     )
