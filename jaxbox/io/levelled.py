@@ -102,4 +102,5 @@ def measure_sweeps(
         )
     up = np.median([mounting.up for mounting in seen], axis=0)
     x, y, z = (float(value) for value in up / np.linalg.norm(up))
-    return Mounting(position, (x, y, z), float(np.median([mounting.height_m for mounting in seen]))).raised()
+    heights_m = [mounting.height_m for mounting in seen if mounting.height_m is not None]
+    return Mounting(position, (x, y, z), float(np.median(heights_m))).raised()
