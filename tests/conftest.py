@@ -3,11 +3,19 @@
 import os
 import pathlib
 
+import hypothesis
 import jax
 import parity
 import pytest
 
 DATA = pathlib.Path(os.environ.get("JAXBOX_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
+
+
+# The same few examples each time; `--hypothesis-profile=long` draws many new ones.
+_options = {"deadline": None, "database": None, "suppress_health_check": list(hypothesis.HealthCheck)}
+hypothesis.settings.register_profile("ci", max_examples=20, derandomize=True, **_options)
+hypothesis.settings.register_profile("long", max_examples=1000, print_blob=True, **_options)
+hypothesis.settings.load_profile("ci")
 
 
 def pytest_configure(config: pytest.Config) -> None:
