@@ -21,7 +21,7 @@ import numpy as np
 
 import jaxbox
 from benchmarks import bench_sensors, common
-from benchmarks.bad_input import street
+from benchmarks.bad_input import PRESETS, street
 from jaxbox import Detections, DetectorConfig, PointCloud
 from jaxbox.evaluation import pairwise_overlaps
 from jaxbox.streaming import THREADS_VARIABLE
@@ -288,6 +288,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Prints the tables and writes the report; ends with exit code 1 where bits differ that must not."""
     parser = common.parser(__doc__ or "", preset=False, quick="small synthetic sweeps, few repeats and keys")
     parser.add_argument("--digests-of", choices=sorted(DetectorConfig.presets()), help=argparse.SUPPRESS)
+    parser.add_argument("--presets", nargs="+", choices=sorted(DetectorConfig.presets()), default=PRESETS)
     parser.add_argument("--keys", type=int, help=f"random keys to try, {KEYS} by default")
     options: argparse.Namespace = parser.parse_args(arguments)
     if options.digests_of:
@@ -295,7 +296,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     keys = options.keys or (QUICK_KEYS if options.quick else KEYS)
     report: dict[str, Any] = {"same_bits": {}, "keys": {}}
-    for preset in ("default", "paper"):
+    for preset in options.presets:
         report["same_bits"][preset] = compare(options, preset)
         config = common.chosen_config(options, preset=preset)
         report["keys"][preset] = spread_over_keys(sweeps_for_keys(options.quick), config, keys)

@@ -291,6 +291,81 @@ def refused() -> str:
     return table(["input", "`ValueError`"], load("bad_input")["refused"].items())
 
 
+def same_bits() -> str:
+    """Where answers came about, and whether their bits are those of the first."""
+    report = load("determinism")
+    both = report["same_bits"]
+    first = next(iter(both.values()))
+    repeats = [f"{both[preset]['different_answers']} differ" for preset in both]
+    rows = [(f"{first['repeats']} repeats of {len(first['sweeps'])} sweeps", *repeats)]
+    for group in ("same_in_batches", "same_in_processes", "same_in_other_programs"):
+        for name in first[group]:
+            rows.append((name, *("same bits" if both[preset][group][name] else "differs" for preset in both)))
+    return table(["", *both], rows) + made_with(report)
+
+
+def keys() -> str:
+    """How often objects are there with other keys."""
+    report = load("determinism")
+    rows = []
+    for preset, spread in report["keys"].items():
+        for scores, row in {"all": spread, **spread["by_median_score"]}.items():
+            shares = [share(row[name], row["objects"]) for name in PRESENCE]
+            rows.append((preset, scores, row["objects"], *shares))
+    names = ("above the cut with every key", "with nine of ten keys", "there at some score with every key")
+    return table(["preset", "median score", "objects", *names], rows)
+
+
+PRESENCE = ("above_cut_with_every_key", "above_cut_with_nine_of_ten_keys", "with_every_key_at_some_score")
+
+
+def share(part: int, whole: int) -> str:
+    """In percent."""
+    return f"{100 * part / whole:.1f} %" if whole else ""
+
+
+def moves() -> str:
+    """How far boxes are from the median box of their object."""
+    spreads = load("determinism")["keys"]
+    first = next(iter(spreads.values()))["moves"]
+    names = list(next(iter(first.values())))
+    rows = [
+        (preset, quantity, *values.values())
+        for preset, spread in spreads.items()
+        for quantity, values in spread["moves"].items()
+    ]
+    return table(["preset", "distance from the median box", *names], rows)
+
+
+def soak() -> str:
+    """The figures of both runs of the soak."""
+    report = load("soak")
+    runs = {"real sweeps": report["real"], "any size": report["varied"]}
+    points = [f"{run['points']['least']:,} to {run['points']['most']:,}" for run in runs.values()]
+    rows: list[tuple[Any, ...]] = [
+        ("frames", *(f"{run['frames']:,}" for run in runs.values())),
+        ("points of a frame", *points),
+        ("recompiles", *(run["recompiles"] for run in runs.values())),
+        (
+            "growth of memory, kB per 1,000 frames",
+            *(run["growth_kb_per_1000_frames"] for run in runs.values()),
+        ),
+        ("memory, first half, MB", *(run["median_mb_of_first_half"] for run in runs.values())),
+        ("memory, second half, MB", *(run["median_mb_of_second_half"] for run in runs.values())),
+        ("peak of memory, MB", *(run["peak_mb"] for run in runs.values())),
+    ]
+    for name in report["real"]["frame_ms"]:
+        rows.append((f"a frame, {name}, ms", *(run["frame_ms"][name] for run in runs.values())))
+    return table(["", *runs], rows) + made_with(report)
+
+
+def soak_sizes() -> str:
+    """Time of a frame by the capacity that its sweep was padded to."""
+    report = load("soak")["varied"]
+    rows = [(f"{int(c):,}", *values.values()) for c, values in report["frame_ms_by_capacity"].items()]
+    return table(["capacity", *(f"{name}, ms" for name in report["frame_ms"])], rows)
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "accuracy": accuracy,
     "sizes": sizes,
@@ -312,4 +387,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "counts": counts,
     "bad_input": bad_input,
     "refused": refused,
+    "same_bits": same_bits,
+    "keys": keys,
+    "moves": moves,
+    "soak": soak,
+    "soak_sizes": soak_sizes,
 }
