@@ -3,6 +3,7 @@
 import os
 import pathlib
 import struct
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,12 @@ _NUM_HEADER_BYTES = 375
 """Of the longest header, that of LAS 1.4."""
 _VLR_BYTES, _EVLR_BYTES = 54, 60
 """Least size of a variable length record, and of an extended one."""
+_LASZIP_RECORD, _ITEMS = 22204, 32
+"""The record of a LAZ file that says how points are packed, and where in it their items are listed."""
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+"""Layers of the items of LAS 1.4: point, colours, colours with infrared, waveform."""
+_EXTRA_BYTES = 14
+"""An item with a layer a byte."""
 _COMPRESSED = 0x80
 """Bit of the point format that LAZ sets."""
 
@@ -52,6 +59,8 @@ def read_las(path: str | os.PathLike[str]) -> Points:
             check_unpacked(needed, str(path))
             if not header.are_points_compressed:
                 check_num_bytes(needed, size - header.offset_to_point_data, str(path))
+            else:
+                _check_layers(pathlib.Path(path), header, size)
             points = reader.read()
     except InputError:
         raise
@@ -84,6 +93,32 @@ def _check_tables(path: pathlib.Path, size: int) -> None:
         _, num_chunks = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
         # No chunk is smaller than a byte.
         check_num_bytes(num_chunks, size, str(path))
+
+
+def _check_layers(path: pathlib.Path, header: Any, size: int) -> None:
+    """Holds the layers of LAZ chunks against the file's size; the decoder allocates what each claims.
+
+    Reference: Isenburg, "LASzip: lossless compression of LiDAR data", 2013, and the LAZ 1.4 specification: a
+    chunk is a point, the number of points, the size of each layer, and the layers.
+    """
+    lazrs = require("lazrs", extra="las", what="LAZ files")
+    (record,) = [vlr.record_data for vlr in header.vlrs if vlr.record_id == _LASZIP_RECORD]
+    (num_items,) = struct.unpack_from("<H", record, _ITEMS)
+    items = [struct.unpack_from("<HH", record, _ITEMS + 2 + 6 * index) for index in range(num_items)]
+    num_layers = sum(num_bytes if kind == _EXTRA_BYTES else _LAYERS.get(kind, 0) for kind, num_bytes in items)
+    if not num_layers:
+        return
+    with path.open("rb") as file:
+        file.seek(header.offset_to_point_data)
+        chunks = lazrs.read_chunk_table(file, lazrs.LazVlr(record))
+        # The table's own place comes first.
+        start = header.offset_to_point_data + 8
+        for _, num_bytes in chunks:
+            if num_bytes:
+                file.seek(start + header.point_format.size + 4)
+                layers = struct.unpack(f"<{num_layers}I", file.read(4 * num_layers))
+                check_num_bytes(sum(layers), size - start, str(path))
+            start += num_bytes
 
 
 def _read_int64(data: bytes) -> int:

@@ -75,7 +75,7 @@ def read_npz(path: str | os.PathLike[str]) -> Points:
     """
     check_file(path)
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with pathlib.Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
             if {"x", "y", "z"} <= set(arrays.files):
                 names = [name for name in _COLUMNS if name in arrays.files]
             else:
