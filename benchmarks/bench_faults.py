@@ -1,37 +1,43 @@
 """What a killed `jaxbox detect` leaves behind, and whether a resumed run ends with the same results.
 
-    python -m benchmarks.bench_faults [--kills 50] [--sweeps 8] [--json FILE]
+    python -m benchmarks.bench_faults [--kills 50] [--sweeps 4] [--json FILE]
 
-A run over synthetic sweeps is killed (SIGKILL) at random moments from its start to its usual end, and the
-same command with ``--resume`` is started over and over, until it was killed so often, and then left alone.
+A run over synthetic sweeps is killed (SIGKILL) at random moments from its start to its end, and the same
+command with ``--resume`` is started over and over, until it was killed so often, and then left alone.
 KITTI text, JSON Lines, Parquet and pictures have to be those of a run that nothing disturbed, byte for byte.
 After each kill every file that has its name is read: it has to be whole.
 """
 
 import argparse
 import collections
+import contextlib
+import itertools
 import json
+import os
 import pathlib
 import random
+import re
+import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
 from typing import Any
 
 from benchmarks import common
 from jaxbox import io, synthetic
 from jaxbox.io.parquet import finished_parquet
 
-KILLS, SWEEPS = 50, 8
+KILLS, SWEEPS = 50, 4
 NUM_AZIMUTHS = 250
 """Small sweeps, of the smallest capacity."""
 OPTIONS = ("--format", "kitti", "--format", "jsonl", "--format", "parquet")
 ACCOUNTS = ("run.json",)
 """Files that say when a run was; all others have to be the same."""
-_MARGIN = 1.1
-"""Kills come up to a tenth later than a run usually ends."""
+_START_SHARE = 0.8
+"""Of a short run's time that passes before its first sweep is done."""
+_LONGEST_SWEEP_S = 0.5
+_SWEEP_LINE = re.compile(r"\d{6}: ")
 
 
 def write_sweeps(folder: pathlib.Path, count: int) -> None:
@@ -51,14 +57,24 @@ def command(sweeps: pathlib.Path, output: pathlib.Path, *options: str) -> list[s
     ]
 
 
-def run(words: list[str], *, kill_after_s: float | None = None) -> int:
-    """Runs a command, killed after so long; returns its exit code, negative for a signal."""
-    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        return process.wait(kill_after_s)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        return process.wait()
+def run(words: list[str], *, kill_after: tuple[int, float] | None = None) -> int:
+    """Runs a command, killed so many seconds after so many of its lines about a sweep; its exit code.
+
+    Moments are counted in sweeps rather than seconds because most of a short run is its start.
+    """
+    environment = os.environ | {"PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, env=environment
+    ) as process:
+        if kill_after is not None:
+            num_lines, delay_s = kill_after
+            lines = (line for line in process.stdout or () if _SWEEP_LINE.match(line))
+            collections.deque(itertools.islice(lines, num_lines), maxlen=0)
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(delay_s)
+            process.kill()
+        process.communicate()
+    return process.returncode
 
 
 def contents(folder: pathlib.Path) -> dict[str, bytes]:
@@ -87,14 +103,13 @@ def broken(folder: pathlib.Path) -> list[str]:
     return found
 
 
-def stage_of(files: Mapping[str, Any], num_sweeps: int) -> str:
-    """How far a killed run had come, by the files with names."""
-    texts = sum(name.endswith(".txt") for name in files)
-    if "run.json" not in files:
-        return "before its first file"
-    if "detections.parquet" in files:
-        return "after its last result file"
-    return f"with {'no' if not texts else 'all' if texts == num_sweeps else 'some'} sweeps done"
+def stage_of(killed: pathlib.Path, num_done: int, num_sweeps: int) -> str:
+    """How far a killed run had come."""
+    if (killed / "detections.parquet").exists():
+        return "while or after the result files took their names"
+    if num_done == 0:
+        return "before the first sweep was done"
+    return "after the last sweep" if num_done == num_sweeps else "between sweeps"
 
 
 def kill_and_resume(sweeps: pathlib.Path, root: pathlib.Path, *, kills: int, seed: int) -> dict[str, Any]:
@@ -110,29 +125,34 @@ def kill_and_resume(sweeps: pathlib.Path, root: pathlib.Path, *, kills: int, see
       What happened: when kills came, how far the runs had come, files that differ or were broken.
     """
     plain, killed = root / "undisturbed", root / "killed"
+    num_sweeps = len(list((sweeps / "velodyne").iterdir()))
     start = time.monotonic()
     if run(command(sweeps, plain)):
         raise SystemExit("the undisturbed run failed")
     usual_s = time.monotonic() - start
     rng = random.Random(seed)
     reached: collections.Counter[str] = collections.Counter()
-    half_written, num_killed, num_ended = [], 0, 0
-    while num_killed < kills:
-        # A run that ended by itself has nothing left to do: the next begins anew.
-        if run(command(sweeps, killed, "--resume"), kill_after_s=rng.uniform(0, _MARGIN * usual_s)) < 0:
-            num_killed += 1
-            names = [str(path.relative_to(killed)) for path in killed.rglob("*")]
-            reached[stage_of(dict.fromkeys(names), len(list((sweeps / "velodyne").iterdir())))] += 1
+    half_written, num_ended = [], 0
+    while reached.total() < kills:
+        # Before the first sweep anywhere in the start, after that anywhere up to the next sweep, or the end.
+        num_lines = rng.randint(0, num_sweeps)
+        moment = num_lines, rng.uniform(0, _START_SHARE * usual_s if num_lines == 0 else _LONGEST_SWEEP_S)
+        code = run(command(sweeps, killed, "--resume"), kill_after=moment)
+        if code == -signal.SIGKILL:
+            reached[stage_of(killed, num_lines, num_sweeps)] += 1
             half_written += broken(killed)
+            print(f"killed {reached.total()} times", file=sys.stderr)
+        elif code:
+            raise SystemExit(f"a resumed run ended with exit code {code}")
         else:
+            # It has nothing left to do: the next begins anew.
             num_ended += 1
-            if num_killed < kills:
-                (killed / "detections.parquet").unlink()
+            (killed / "detections.parquet").unlink()
     code = run(command(sweeps, killed, "--resume"))
     expected, found = contents(plain), contents(killed)
     differing = sorted(name for name in {*expected, *found} if expected.get(name) != found.get(name))
     return {
-        "kills": num_killed, "ended_by_themselves": num_ended, "usual_s": usual_s,
+        "kills": reached.total(), "ended_by_themselves": num_ended, "usual_s": usual_s,
         "reached": dict(sorted(reached.items())), "half_written": half_written,
         "final_exit_code": code, "files": len(expected), "differing": differing,
     }  # fmt: skip

@@ -16,7 +16,7 @@ fuzz_targets = importlib.import_module("benchmarks.fuzz_targets")
 sys.path.remove(str(PROJECT))
 
 TARGETS = fuzz_targets.TARGETS
-COPIES = 40
+COPIES = 25
 """Changed copies a reader; `python -m benchmarks.fuzz_readers` makes as many as there is time for."""
 CORPUS = pathlib.Path(__file__).parent / "corpus"
 FOUND = sorted(path for path in CORPUS.glob("*/*"))

@@ -62,12 +62,14 @@ def read_las(path: str | os.PathLike[str]) -> Points:
             else:
                 _check_layers(pathlib.Path(path), header, size)
             points = reader.read()
+        # A scale that is no number makes points that are none, which the detector counts.
+        with np.errstate(all="ignore"):
+            columns = {name: np.asarray(getattr(points, name)) for name in ("x", "y", "z", "intensity")}
     except InputError:
         raise
     # laspy and its decoders raise whatever the bytes lead them to; lazrs even its own Rust errors.
     except Exception as error:
         raise InputError(f"{path}: no readable LAS or LAZ file ({reason(error)}); copy it again.") from error
-    columns = {name: np.asarray(getattr(points, name)) for name in ("x", "y", "z", "intensity")}
     _check_frame(columns, str(path))
     return named_points(columns, str(path))
 
@@ -127,7 +129,8 @@ def _read_int64(data: bytes) -> int:
 
 def _check_frame(columns: dict[str, np.ndarray], where: str) -> None:
     for name in "xy":
-        middle = float(np.median(columns[name])) if len(columns[name]) else 0.0
+        there = columns[name][np.isfinite(columns[name])]
+        middle = float(np.median(there)) if len(there) else 0.0
         if abs(middle) > MAP_DISTANCE_M:
             raise InputError(
                 f"{where}: {name} is about {middle:.0f} m: these are map coordinates. Subtract the sensor's "
