@@ -65,6 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("report", type=pathlib.Path, help="what `coverage json` wrote")
+    parser.add_argument("--tests", default="the whole suite", help="which tests were run, for the report")
     parser.add_argument("--json", type=pathlib.Path, help="also write the table to this file")
     options = parser.parse_args(arguments)
     files = json.loads(options.report.read_text("utf-8"))["files"]
@@ -74,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for path, places in missing.items():
         branches = ", ".join(f"{start} to {end}" for start, end in places["branches"])
         print(f"{path}: lines {places['lines']}; branches {branches or 'none'}")
-    common.write_report({"parts": parts, "uncovered": missing}, options)
+    common.write_report({"tests": options.tests, "parts": parts, "uncovered": missing}, options)
 
 
 if __name__ == "__main__":

@@ -196,7 +196,7 @@ def coverage() -> str:
     report = load("coverage")
     names = ("lines", "lines missed", "branches", "branches missed", "percent")
     rows = [(f"`{part}`", *(row[n] for n in names)) for part, row in report["parts"].items()]
-    return table(["", *names], rows) + made_with(report)
+    return table(["", *names], rows) + f"\n\nOf {report['tests']}." + made_with(report)
 
 
 def cluster() -> str:
