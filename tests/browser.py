@@ -86,6 +86,8 @@ class Visit:
 
     def drag(self, label: str, share: float) -> None:
         """Drags a slider's thumb to a share of its length."""
+        # The mouse goes by places on the screen.
+        self.control(label).scroll_into_view_if_needed()
         thumb, track = self.control(label).get_by_role("slider"), self.control(label).bounding_box()
         start = thumb.bounding_box()
         assert track is not None
