@@ -108,8 +108,7 @@ class ViserPage:
         if self._timeline.value != wanted.index + 1:
             self._timeline.value = wanted.index + 1
         self._play.label = _PAUSE if wanted.playing else _PLAY
-        # A threshold that the user moves is not set: it would jump back under the hand.
-        if wanted.preset != before.preset or not wanted.changes:
+        if wanted.preset != before.preset or (before.changes and not wanted.changes):
             config = wanted.config
             for threshold in _all_thresholds():
                 slider = self._sliders[threshold.name]

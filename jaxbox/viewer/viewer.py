@@ -132,6 +132,9 @@ class Viewer:
     def run(self) -> None:
         """Answers what is wanted, until `stop`."""
         while (wanted := self._next()) is not None:
+            # The controls follow the last wish, not the one that is answered: they would jump back under
+            # the hand that moves them.
+            self._page.follow(self._wanted)
             self.answer(wanted)
 
     def answer(self, wanted: Wanted) -> None:
@@ -140,7 +143,6 @@ class Viewer:
         Args:
           wanted: what to show.
         """
-        self._page.follow(wanted)
         try:
             self._show(wanted)
         except (InputError, ImportError, OSError, ValueError) as error:
