@@ -318,7 +318,7 @@ objects = st.builds(
     length=finite(0, 40),
     location=arrays(np.float64, 3, elements=finite(-200, 200)),
     rotation_y=angles,
-    score=st.none() | finite(-1e3, 1e3),
+    score=st.none() | finite(0, 1, width=32),
 )
 
 
