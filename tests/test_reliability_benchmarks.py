@@ -2,6 +2,9 @@
 
 import json
 import pathlib
+import shlex
+import subprocess
+import tomllib
 
 import numpy as np
 import pytest
@@ -121,3 +124,16 @@ def test_coverage_is_summed_by_part():
     assert parts["io"]["percent"] == pytest.approx(100 * 56 / 60)
     assert parts["all"]["lines"] == 60
     assert list(coverage_table.uncovered(files)) == ["jaxbox/io/a.py"]
+
+
+@pytest.mark.parametrize("module", sorted(bench_mutation.TESTS))
+def test_the_command_of_a_module_is_one_shell_line_with_a_limit_of_time(module, tmp_path):
+    bench_mutation.write_config(module, tmp_path / "config.toml")
+    settings = tomllib.loads((tmp_path / "config.toml").read_text())["cosmic-ray"]
+    shell, flag, line = shlex.split(settings["test-command"])
+    assert (shell, flag) == ("bash", "-c")
+    limit, tests = line.split("; exec ")
+    assert limit == f"ulimit -t {bench_mutation.MAX_CPU_S}"
+    assert shlex.split(tests)[1:3] == ["-m", "pytest"]
+    assert shlex.split(tests)[-1] in bench_mutation.TESTS[module].replace("'", "")
+    subprocess.run([shell, "-n", flag, line], check=True)
