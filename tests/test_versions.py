@@ -20,6 +20,8 @@ SWEEP = synthetic.make_sweep(0, num_beams=32, num_azimuths=520)
 # The fewest maps, so that it compiles fastest.
 CONFIG = DetectorConfig.fast()
 SAME_IOU = 0.7
+NUM_FOUND = 5
+"""Boxes worth acting on in this sweep, of which most cars hold a few points only."""
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +30,8 @@ def found():
 
 
 def rows(detections):
-    keep = np.asarray(detections.valid) & (np.asarray(detections.score) >= jaxbox.DEFAULT_CUT)
+    # The reference has no padding.
+    keep = np.asarray(detections.score) >= jaxbox.DEFAULT_CUT
     return np.column_stack([detections.center, detections.size, detections.yaw])[keep].astype(float)
 
 
@@ -37,7 +40,8 @@ def test_the_boxes_are_vehicles_and_those_of_the_reference(found):
     boxes = rows(found)
     overlap, _ = pairwise_overlaps(boxes, other)
     # The planes of their random samples differ a little, so the last box by score may be one side's alone.
-    assert np.sum(overlap.max(axis=1) > SAME_IOU) >= len(boxes) - 1 > 4
+    assert len(boxes) >= NUM_FOUND
+    assert np.sum(overlap.max(axis=1) > SAME_IOU) >= len(boxes) - 1
     assert np.sum(overlap.max(axis=0) > SAME_IOU) >= len(other) - 1
     truth = np.column_stack([SWEEP.boxes.center, SWEEP.boxes.size, SWEEP.boxes.yaw])
     assert np.mean(pairwise_overlaps(boxes, truth)[0].max(axis=1) > 0.3) > 0.8
@@ -66,7 +70,7 @@ def test_the_command_line_detects_and_writes(tmp_path):
     )
     assert result.exit_code == 0, result.output
     record = jaxbox.io.read_jsonl(tmp_path / "out" / "detections.jsonl")[0]
-    assert sum(box["score"] >= jaxbox.DEFAULT_CUT for box in record["boxes"]) > 4
+    assert sum(box["score"] >= jaxbox.DEFAULT_CUT for box in record["boxes"]) >= NUM_FOUND
 
 
 def parts(version):

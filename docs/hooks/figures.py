@@ -245,6 +245,19 @@ def unrecorded(benchmark: str, name: str) -> str:
     return f"*Not recorded yet: `{command}`.*"
 
 
+def beams() -> str:
+    """KITTI thinned: the preset of 64 beams against the sensor's."""
+    report = load("beams")
+    rows = [tuple(row.values()) for row in report["kitti"]]
+    return table(list(report["kitti"][0]), rows) + made_with(report)
+
+
+def beams_synthetic() -> str:
+    """The same on ray-cast streets."""
+    rows = load("beams")["synthetic"]
+    return table(list(rows[0]), [tuple(row.values()) for row in rows])
+
+
 def status() -> str:
     """Every bit and its sentence."""
     bits = [bit for bit in Status if bit.value]
@@ -383,6 +396,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "coverage": coverage,
     "cluster": cluster,
     "archives": archives,
+    "beams": beams,
+    "beams_synthetic": beams_synthetic,
     "status": status,
     "counts": counts,
     "bad_input": bad_input,

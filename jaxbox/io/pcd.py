@@ -51,6 +51,9 @@ def read_pcd(path: str | os.PathLike[str]) -> Points:
         lines = _read_header_lines(file, str(path))
         header = _parse_header(lines, pypcd4, str(path))
         check_num_points(header.points, str(path))
+        if header.points == 0:
+            # pypcd4 makes other than numbers of them under NumPy 1.
+            return named_points({name: np.zeros(0) for name in header.build_dtype().names}, str(path))
         if header.data.value == "ascii":
             return named_points(_read_ascii(file, header, str(path)), str(path))
         _check_body(file, header, size, str(path))
