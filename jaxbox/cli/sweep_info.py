@@ -10,7 +10,7 @@ from rich.console import Console
 from jaxbox import io
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation.beams import beam_of_points, goes_beam_by_beam
-from jaxbox.mounting import MIN_SENSOR_HEIGHT_M, measure_mounting
+from jaxbox.mounting import MIN_SENSOR_HEIGHT_M, Mounting, measure_mounting
 from jaxbox.padding import fitting_capacity
 from jaxbox.sensors import TUNED_BEAMS, fitting_sensor
 from jaxbox.settings import changed_settings
@@ -21,6 +21,7 @@ VEHICLE_ELEVATION_DEG = (-10.0, 0.0)
 """Beams between these meet the vehicles: from a roof, those from 10 m on."""
 MAX_LEVEL_TILT_DEG = 3.0
 """A sensor tilted more is better seen upright: ``python -m benchmarks.bench_mounting``."""
+LEVEL_OPTION = "--level"
 _MIN_TURN_POINTS = 100
 _MAX_TURNS = 256
 _NEAR_M = 3.0
@@ -214,11 +215,13 @@ def print_sweep_info(
         clouds.append(xyz)
         infos.append(look_at(sweep.name, xyz, intensity, timestamp_ns=sweep.timestamp_ns))
     beams = fitting_beams(infos)
+    options = advised_options(infos, beams)
+    if LEVEL_OPTION in options:
+        clouds = [(measure_mounting(xyz) or Mounting()).raised().level(xyz) for xyz in clouds]
     changes = fitting_settings(clouds, base=DetectorConfig.for_sensor(beams))
     capacity = fitting_capacity(max(len(xyz) for xyz in clouds))
     if as_json:
         found = [dataclasses.asdict(info) for info in infos]
-        options = advised_options(infos, beams)
         fits = {
             "preset": "default",
             "sensor": beams,
@@ -233,7 +236,7 @@ def print_sweep_info(
         for line in describe(info):
             console.print(line, markup=False)
     console.print(f"fits: preset default for {beams} beams, padded to {capacity} points", markup=False)
-    if options := advised_options(infos, beams):
+    if options:
         console.print(f"  jaxbox detect ... {' '.join(options)}", markup=False)
     for name, value in changes.items():
         console.print(f"  {name} = {value}", markup=False)
@@ -256,7 +259,7 @@ def advised_options(infos: Sequence[SweepInfo], beams: int) -> list[str]:
     heights = [info.sensor_height_m for info in infos if info.sensor_height_m is not None]
     low = any(height < MIN_SENSOR_HEIGHT_M for height in heights)
     tilted = len(tilts) > 0 and np.median(tilts) > MAX_LEVEL_TILT_DEG
-    return options + (["--level"] if low or tilted else [])
+    return options + ([LEVEL_OPTION] if low or tilted else [])
 
 
 def describe(info: SweepInfo) -> list[str]:
