@@ -51,7 +51,7 @@ def worker_counts(cores: int) -> list[int]:
 def summarise(report: DatasetReport, num_bytes_out: int) -> dict[str, float]:
     """One run in numbers; the rate of a worker is over its own time, without starting and compiling."""
     parts = report.partitions
-    busy: dict[str, float] = collections.defaultdict(float)
+    busy: collections.defaultdict[str, float] = collections.defaultdict(float)
     for part in parts:
         busy[part.worker] += part.seconds
     sweeps = sum(part.num_sweeps for part in parts)

@@ -345,7 +345,7 @@ def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_p
     manifest = manifest_of(tmp_path)
     assert (manifest["num_done"], manifest["num_failed"], manifest["num_boxes"]) == (5, 1, len(local))
     assert manifest["deaths"] == {"part-000002": 1}
-    assert "part-000002: 1 workers died on it" in result.stderr
+    assert "part-000002: a worker died on it; it was begun anew" in result.stderr
     (failure,) = manifest["failures"]
     assert failure["url"] == f"{url}/drive_1/{BROKEN}.bin"
     assert failure["reason"].startswith(f"{failure['url']}: 17 bytes is no multiple of 16")

@@ -109,7 +109,8 @@ def _run(paths: Sequence[str], options: RayOptions, progress: Progress, speaks: 
 def _tell(part: PartitionReport, options: RayOptions, speaks: bool) -> None:
     """One partition: what went wrong to stderr, and what was done to stdout."""
     if part.num_deaths:
-        print_error(f"{part.name}: {part.num_deaths} workers died on it; it was begun anew.")
+        workers = "a worker" if part.num_deaths == 1 else f"{part.num_deaths} workers"
+        print_error(f"{part.name}: {workers} died on it; it was begun anew.")
     for failure in part.failures:
         print_error(f"sweep {failure['sweep']}: {failure['reason']}")
     if part.error is not None:
