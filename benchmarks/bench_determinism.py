@@ -24,7 +24,7 @@ from benchmarks import bench_sensors, common
 from benchmarks.bad_input import PRESETS, street
 from jaxbox import Detections, DetectorConfig, PointCloud
 from jaxbox.evaluation import pairwise_overlaps
-from jaxbox.streaming import THREADS_VARIABLE
+from jaxbox.workers import THREADS_VARIABLE
 
 REPEATS, QUICK_REPEATS = 100, 10
 KEYS, QUICK_KEYS = 50, 5
