@@ -144,7 +144,7 @@ def test_the_settings_are_copied_and_downloaded(visit, served, tmp_path):
 def test_the_timeline_passes_over_a_sweep_that_cannot_be_read(visit):
     visit.type_value("sweep", 2)
     visit.wait(lambda: "000001.bin" in visit.text("error"))
-    assert box_pixels(visit) < 100
+    visit.wait(lambda: box_pixels(visit) < 100)
     visit.press("next")
     visit.wait(lambda: visit.text("name") == "000002")
     assert visit.number("vehicles") == num_boxes(2)
