@@ -26,7 +26,8 @@ from jaxbox.io import open_sweeps
 
 SWEEPS, QUICK_SWEEPS = 480, 80
 REPEATS = 3
-PARTITION = 40
+PARTITIONS_PER_CORE = 6
+"""So that no worker waits long for the last one."""
 ARCHIVES = (10**6, 10**9)
 """Sizes of archives, sweeps, for which the work is worked out."""
 SECONDS_PER_HOUR = 3600
@@ -69,10 +70,12 @@ def summarise(report: DatasetReport, num_bytes_out: int) -> dict[str, float]:
     }
 
 
-def run_cluster(archive: pathlib.Path, config: DetectorConfig, workers: int) -> dict[str, float]:
+def run_cluster(
+    archive: pathlib.Path, config: DetectorConfig, workers: int, partition: int
+) -> dict[str, float]:
     """One run over the archive, with a Ray and an output of its own."""
     with tempfile.TemporaryDirectory() as output:
-        report = detect_dataset(archive, output, config, workers=workers, sweeps_per_partition=PARTITION)
+        report = detect_dataset(archive, output, config, workers=workers, sweeps_per_partition=partition)
         if report.failures:
             raise SystemExit(f"{len(report.failures)} sweeps failed: {report.failures[0]}")
         written = sum(path.stat().st_size for path in pathlib.Path(output).glob("*.parquet"))
@@ -119,6 +122,7 @@ def archives(figures: dict[str, float]) -> dict[str, dict[str, float]]:
 def measure(config: DetectorConfig, sweeps: int, repeats: int) -> dict[str, Any]:
     """All runs, those that are compared one after the other."""
     counts = worker_counts(os.cpu_count() or 1)
+    partition = max(1, sweeps // (PARTITIONS_PER_CORE * counts[-1]))
     runs: dict[int, list[dict[str, float]]] = {count: [] for count in counts}
     streams: dict[int, list[float]] = {count: [] for count in counts}
     with tempfile.TemporaryDirectory() as folder:
@@ -126,11 +130,12 @@ def measure(config: DetectorConfig, sweeps: int, repeats: int) -> dict[str, Any]
         link_sweeps(archive, sweeps)
         for _ in range(repeats):
             for count in counts:
-                runs[count].append(run_cluster(archive, config, count))
+                runs[count].append(run_cluster(archive, config, count, partition))
                 streams[count].append(run_stream(archive, config, count))
     figures = {count: median_of(runs[count]) for count in counts}
     return {
         "sweeps": sweeps,
+        "sweeps_per_partition": partition,
         "workers": {str(count): figures[count] for count in counts},
         "stream_sweeps_per_second": {str(count): statistics.median(streams[count]) for count in counts},
         # With all cores at work, as on a cluster.

@@ -1,6 +1,6 @@
 """The benchmarks of time and memory: what they count, and when the guard of CI bites."""
 
-import importlib
+import importlib.util
 import json
 import pathlib
 
@@ -122,3 +122,28 @@ def test_a_run_of_a_cluster_is_put_in_numbers_and_carried_to_an_archive(benchmar
     assert million["hours_on_1000_cores"] == pytest.approx(million["core_hours"] / 1000)
     assert (million["terabytes_read"], million["gigabytes_written"]) == pytest.approx((0.002, 0.1))
     assert cluster.worker_counts(6) == [1, 2, 4, 6]
+
+
+def test_the_report_of_a_cluster_fills_the_tables_of_its_page(benchmark, tmp_path, monkeypatch, capsys):
+    cluster = benchmark("bench_cluster")
+    names = [name for _, name, _ in load_hook().CLUSTER_ROWS]
+    monkeypatch.setattr(cluster, "link_sweeps", lambda folder, count: None)
+    monkeypatch.setattr(cluster, "run_cluster", lambda *_: {name: 2e3 for name in names})
+    monkeypatch.setattr(cluster, "run_stream", lambda *_: 3.0)
+    cluster.main(["--quick", "--json", str(tmp_path / "cluster.json")])
+    assert "1e+09" in capsys.readouterr().out
+    hook = load_hook()
+    assert hook.cluster().startswith("*Not recorded yet") or hook.recorded("cluster")
+    hook.RESULTS = tmp_path
+    page = hook.on_page_markdown("<!-- table: cluster -->\n<!-- table: archives -->")
+    assert "| read, MB a sweep | 0.002 |" in page
+    assert "| 1,000,000,000 | 138.9 |" in page
+
+
+def load_hook():
+    """The module that fills the pages' tables."""
+    path = pathlib.Path(__file__).parents[1] / "docs" / "hooks" / "figures.py"
+    spec = importlib.util.spec_from_file_location("figures", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
