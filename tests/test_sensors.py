@@ -2,14 +2,16 @@
 
 import dataclasses
 import importlib
+import json
 import pathlib
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from jaxbox import DetectorConfig, io, synthetic
+from jaxbox import DEFAULT_CUT, DetectorConfig, io, synthetic
 from jaxbox.capacities import CAPACITY_STEP
-from jaxbox.cli import sweep_info
+from jaxbox.cli import app, sweep_info
 from jaxbox.cli.settings import chosen_config
 from jaxbox.evaluation import thin_beams
 from jaxbox.sensors import SENSORS, fitting_sensor
@@ -136,3 +138,28 @@ def test_no_drive_is_both_chosen_on_and_held_out(monkeypatch):
     off = {drives[name] for name in drives if not chosen[name]}
     assert not on & off
     assert (len(on), len(off)) == (6, 6)
+
+
+def test_detect_sees_a_tilted_sweep_from_the_ground_upright(tmp_path):
+    sweep = synthetic.make_sweep(0, num_beams=32, num_azimuths=520)
+    sin, cos = np.sin(np.radians(15)), np.cos(np.radians(15))
+    pitch = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+    sensor_at = np.array([1.0, 0.5, 1.73])
+    np.save(tmp_path / "upright.npy", sweep.xyz)
+    np.save(tmp_path / "tilted.npy", sweep.xyz @ pitch.T + sensor_at)
+    options = ["--preset", "fast", "--capacity", "16384", "--format", "jsonl", "--no-pictures", "--quiet"]
+    mounted = ["--level", "--sensor-at", *map(str, sensor_at)]
+    boxes = {}
+    for name, more in (("upright", []), ("tilted", mounted)):
+        words = [tmp_path / f"{name}.npy", "--output", tmp_path / name, *options, *more]
+        result = CliRunner().invoke(app, ["detect", *map(str, words)])
+        assert result.exit_code == 0, result.output
+        record = io.read_jsonl(tmp_path / name / "detections.jsonl")[0]
+        boxes[name] = np.array([b["center"] for b in record["boxes"] if b["score"] >= DEFAULT_CUT])
+    assert len(boxes["tilted"]) >= len(boxes["upright"]) - 1 >= 4
+    # Of boxes worth acting on, at most one is another's: the points differ by a hair.
+    distance = np.linalg.norm(boxes["tilted"][:, None] - boxes["upright"], axis=-1).min(axis=0)
+    assert np.sum(distance < 0.3) >= len(boxes["upright"]) - 1
+    T = np.array(json.loads((tmp_path / "tilted" / "run.json").read_text())["options"]["T_level_points"])
+    np.testing.assert_allclose(T[:3, :3] @ pitch, np.eye(3), atol=0.01)
+    np.testing.assert_allclose(T @ [*sensor_at, 1], [0, 0, 0, 1], atol=1e-5)
