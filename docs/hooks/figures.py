@@ -353,7 +353,8 @@ def moves() -> str:
 def soak() -> str:
     """The figures of both runs of the soak."""
     report = load("soak")
-    runs = {"real sweeps": report["real"], "any size": report["varied"]}
+    first = "small synthetic sweeps" if report["circumstances"]["options"]["quick"] else "real sweeps"
+    runs = {first: report["real"], "any size": report["varied"]}
     points = [f"{run['points']['least']:,} to {run['points']['most']:,}" for run in runs.values()]
     rows: list[tuple[Any, ...]] = [
         ("frames", *(f"{run['frames']:,}" for run in runs.values())),
