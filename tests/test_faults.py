@@ -58,7 +58,7 @@ def faults(monkeypatch):
 
 def test_killed_and_resumed_a_run_ends_as_if_nothing_had_happened(tmp_path, faults, monkeypatch):
     # Processes of their own, which share the compiled detector of these tests: its devices are in its key.
-    monkeypatch.delenv(cache.CACHE_VARIABLE)
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "cache"))
     monkeypatch.setenv("JAX_NUM_CPU_DEVICES", str(jax.config.jax_num_cpu_devices))
     faults.write_sweeps(tmp_path / "sweeps", 2)
     report = faults.kill_and_resume(tmp_path / "sweeps", tmp_path, kills=3, seed=1)
@@ -133,7 +133,7 @@ main()
 
 
 def test_a_file_that_cannot_grow_is_an_error_of_its_own_process_too(sweeps, tmp_path, monkeypatch):
-    monkeypatch.delenv(cache.CACHE_VARIABLE)
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "cache"))
     command = [sys.executable, "-c", LIMITED, "300", "detect", sweeps, "--output", tmp_path / "out"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 2, done.stderr
