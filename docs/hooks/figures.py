@@ -258,6 +258,18 @@ def beams_synthetic() -> str:
     return table(list(rows[0]), [tuple(row.values()) for row in rows])
 
 
+def mounting() -> str:
+    """Accuracy of tilted and moved sweeps, as they are and upright."""
+    rows = load("mounting")["rows"]
+    by_case: dict[str, dict[str, dict[str, Any]]] = {}
+    for row in rows:
+        by_case.setdefault(row["case"], {})[row["seen"]] = row
+    names, sides = ("AP 3d", "SOFT"), ("as it is", "upright")
+    lines = [(case, *(found[side][n] for n in names for side in sides)) for case, found in by_case.items()]
+    header = ["", *(f"{name}, {side}" for name in names for side in sides)]
+    return table(header, lines) + made_with(load("mounting"))
+
+
 def status() -> str:
     """Every bit and its sentence."""
     bits = [bit for bit in Status if bit.value]
@@ -399,6 +411,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "archives": archives,
     "beams": beams,
     "beams_synthetic": beams_synthetic,
+    "mounting": mounting,
     "status": status,
     "counts": counts,
     "bad_input": bad_input,
