@@ -92,8 +92,9 @@ def status_names(statuses: Sequence[int]) -> list[str]:
 
 def circumstances(options: argparse.Namespace) -> dict[str, Any]:
     """What a figure depends on beside the code: settings, commit, versions and machine."""
+    # The place of a file says nothing of the figures.
     chosen = {
-        name: str(value) if isinstance(value, pathlib.Path) else value
+        name: value.name if isinstance(value, pathlib.Path) else value
         for name, value in vars(options).items()
     }
     return {

@@ -16,6 +16,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, Generic, TypeVar
 
@@ -154,6 +155,8 @@ class ProcessPool(Generic[Item, Result]):
 
 def _keep_interrupts_away() -> None:
     """Keeps Ctrl-C, which a terminal sends to all, from this thread's processes: the parent ends them."""
+    # It lets the signal through again where it starts, which the first process would make it do.
+    resource_tracker.ensure_running()
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
 
 

@@ -85,13 +85,18 @@ def calls(path):
             yield ast.unparse(node.func), keywords, node.lineno
 
 
+BETWEEN_PROCESSES = {"workers.py", "cluster/dataset.py", "cluster/worker.py"}
+"""Here pickle carries items to processes that jaxbox started itself, and nothing from a file."""
+
+
 @pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT)))
 def test_no_file_is_unpickled_or_executed(path):
-    text = path.read_text()
-    assert "import pickle" not in text
+    carries = path.relative_to(ROOT).as_posix() in BETWEEN_PROCESSES
+    assert carries or "import pickle" not in path.read_text()
+    forbidden = {"eval", "exec", "yaml.load", "pickle.load"} | (set() if carries else {"pickle.loads"})
     for name, keywords, line in calls(path):
         where = f"{path.name}:{line}"
-        assert name not in ("eval", "exec", "yaml.load", "pickle.load", "pickle.loads"), where
+        assert name not in forbidden, where
         if name in ("np.load", "numpy.load"):
             assert keywords.get("allow_pickle") == "False", where
         if name.startswith("subprocess."):

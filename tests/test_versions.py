@@ -82,7 +82,7 @@ def test_the_tested_oldest_versions_are_those_that_the_project_allows():
     tested = dict(line.split("==") for line in lines if line and line[0] != "#")
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    used = [name for name in extras if name not in ("docs", "lint", "notebooks", "rerun")]
+    used = ["reference", "plots", "pcd", "las", "arrow", "ros", "mcap"]  # as .ci/run installs the wheel
     wanted = [*project["dependencies"], *(item for name in used for item in extras[name])]
     bounds = dict(
         re.match(r"([\w-]+)(?:\[\w+\])?>=([\d.]+)", item).groups() for item in wanted if ">=" in item

@@ -422,6 +422,7 @@ def view(
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")] = 8080,
     open_browser: Annotated[bool, typer.Option("--open", help="Open the browser at the page.")] = False,
     preset: PresetOption = None,
+    sensor: SensorOption = None,
     settings: SettingsOption = None,
     changes: SetOption = None,
     topic: Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")] = None,
@@ -441,7 +442,7 @@ def view(
     """
     with input_errors():
         options = ViewOptions(
-            config=chosen_config(preset, settings, changes or []),
+            config=chosen_config(preset, settings, changes or [], sensor=sensor),
             host=host,
             port=port,
             topic=topic,

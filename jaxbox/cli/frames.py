@@ -166,7 +166,7 @@ def _write_pictures(
     truth = judged = None
     if labels is not None and calibration is not None:
         truth = label_boxes(labels, calibration)
-        shown = np.asarray(detections.valid) & (np.asarray(detections.score) >= min_score)
+        shown = np.asarray(detections.valid) & (np.asarray(detections.score, np.float64) >= min_score)
         judged = covered_by_labels(detections, labels, calibration)[shown]
     pictures = draw_stages(
         cloud,

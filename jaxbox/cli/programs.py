@@ -26,6 +26,15 @@ from jaxbox.types import Detections, PointCloud
 FOLDER = "programs"
 """Within the folder of the compilation cache."""
 
+TRACED_WITH = (
+    "jax_default_prng_impl",
+    "jax_threefry_partitionable",
+    "jax_enable_x64",
+    "jax_default_matmul_precision",
+    "jax_numpy_dtype_promotion",
+)
+"""What of JAX's configuration a traced program depends on."""
+
 Program = Callable[[PointCloud], Detections]
 
 
@@ -96,7 +105,8 @@ def _fingerprint(settings: Any, capacity: int) -> str:
     device = jax.devices()[0]
     made_of = (
         _source_digest(),
-        (jax.__version__, jaxlib.version.__version__, jax.config.values["jax_default_prng_impl"]),
+        (jax.__version__, jaxlib.version.__version__),
+        tuple(str(jax.config.values.get(name)) for name in TRACED_WITH),
         (device.platform, device.device_kind),
         (capacity, str(settings)),
     )

@@ -194,9 +194,11 @@ class RunAccount:
             return
         earlier = io.read_config(self.output / CONFIG_NAME, base=self.config)
         differing = list(changed_settings(earlier, self.config))
-        with contextlib.suppress(ValueError, TypeError, KeyError, RecursionError, io.InputError):
+        with contextlib.suppress(
+            ValueError, TypeError, KeyError, AttributeError, RecursionError, io.InputError
+        ):
             options = json.loads((self.output / RUN_NAME).read_text("utf-8"))["options"]
-            differing += [name for name, value in self.options.items() if options[name] != value]
+            differing += [name for name, value in self.options.items() if options.get(name) != value]
         if differing:
             raise io.InputError(
                 f"{self.output / CONFIG_NAME}: --resume needs the settings of the earlier run, and "

@@ -96,7 +96,7 @@ def detect_dataset(
     config = DetectorConfig() if config is None else config
     check_settings(config)
     task = Task(
-        output=os.fspath(output),
+        output=_absolute(os.fspath(output)),
         config=jax.tree.map(float, config),
         capacity=capacity,
         min_score=min_score,
@@ -110,6 +110,11 @@ def detect_dataset(
     with _ray(address, workers, cpus_per_worker) as ray:
         run = _Run(task, [os.fspath(source) for source in given], ray, cpus_per_worker)
         return run.run(workers, sweeps_per_partition, resume, on_report)
+
+
+def _absolute(output: str) -> str:
+    """A path that means the same to workers, whose working directory may be another."""
+    return output if "://" in output or "::" in output else os.path.abspath(output)
 
 
 @contextlib.contextmanager
@@ -250,10 +255,14 @@ class _Run:
         text = self._store.read_text(CONFIG)
         if text is None:
             return
-        differing = list(changed_settings(settings_from_toml(text), self.task.config))
-        with contextlib.suppress(ValueError, TypeError, KeyError):
+        try:
+            earlier = settings_from_toml(text, base=self.task.config)
+        except ValueError as error:
+            raise io.InputError(f"{self.task.output}/{CONFIG}: {error}; give another output.") from error
+        differing = list(changed_settings(earlier, self.task.config))
+        with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError):
             options = json.loads(self._store.read_text(MANIFEST) or "")["options"]
-            differing += [name for name, value in self._options.items() if options[name] != value]
+            differing += [name for name, value in self._options.items() if options.get(name) != value]
         if differing:
             raise io.InputError(
                 f"{self.task.output}: an earlier run had other settings: {', '.join(differing)} differ. Give "

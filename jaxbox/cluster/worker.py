@@ -6,7 +6,7 @@ import json
 import os
 import pickle
 import platform
-import resource
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
@@ -26,6 +26,11 @@ from jaxbox.io.results import SweepResult
 from jaxbox.types import Detections, PointCloud
 from jaxbox.versions import versions
 from jaxbox.workers import THREADS_VARIABLE, ahead
+
+if sys.platform == "win32":
+    resource = None
+else:
+    import resource
 
 SUFFIX = ".parquet"
 """Of the partitions' files."""
@@ -207,8 +212,7 @@ class PartitionWorker:
                 report.status[read.ref.name] = int(detections.status)
                 report.num_boxes += len(record["boxes"])
                 write(SweepResult(record=record))
-            # Linux counts in KiB.
-            report.peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
+            report.peak_mb = _peak_mb()
             report.seconds = time.perf_counter() - start - report.compile_s
             metadata[REPORT_KEY] = report.to_json()
 
@@ -258,3 +262,11 @@ class PartitionWorker:
         jax.block_until_ready(detect_batch([empty], self._task.config))
         self._compiled.add(capacity)
         return time.perf_counter() - start
+
+
+def _peak_mb() -> float:
+    """Resident memory of this process at its most; 0 where the system does not say."""
+    if resource is None:
+        return 0.0
+    # Linux counts in KiB.
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6

@@ -89,11 +89,11 @@ def measure_sweeps(
       The mounting.
 
     Raises:
-      InputError: where a sweep cannot be read, or none shows a ground.
+      InputError: where none of them can be read and shows a ground.
     """
     # Every so many: a recording is passed once.
     some = sweeps[:: -(-len(sweeps) // NUM_MEASURED)]
-    found = [measure_mounting(sweep.read_points()[0], position=position) for sweep in some]
+    found = [_measured(sweep, position) for sweep in some]
     seen = [mounting for mounting in found if mounting is not None]
     if not seen:
         raise InputError(
@@ -103,4 +103,14 @@ def measure_sweeps(
     up = np.median([mounting.up for mounting in seen], axis=0)
     x, y, z = (float(value) for value in up / np.linalg.norm(up))
     heights_m = [mounting.height_m for mounting in seen if mounting.height_m is not None]
-    return Mounting(position, (x, y, z), float(np.median(heights_m))).raised()
+    mounting = Mounting(position, (x, y, z), float(np.median(heights_m)))
+    # A position that was given is meant.
+    return mounting if any(position) else mounting.raised()
+
+
+def _measured(sweep: Sweep, position: tuple[float, float, float]) -> Mounting | None:
+    try:
+        return measure_mounting(sweep.read_points()[0], position=position)
+    except InputError:
+        # It will be reported in its turn; the others tell how the sensor stands.
+        return None
