@@ -11,7 +11,8 @@ from test_detector import CAPACITY, found, street
 
 import jaxbox
 from jaxbox import DetectorConfig, PointCloud
-from jaxbox.cli import programs
+from jaxbox.cli import cache, programs
+from jaxbox.cli.timing import TimedDetector
 
 BASE = DetectorConfig()
 
@@ -34,7 +35,8 @@ def traced(monkeypatch):
     def trace(settings, capacity):
         asked.append(capacity)
         shapes = (capacity, 4), (capacity,), (), (settings.num_leaves,)
-        operands = [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes]
+        dtypes = np.float32, np.float32, np.int32, np.float32
+        operands = map(jax.ShapeDtypeStruct, shapes, dtypes)
         num_outputs = jax.tree.structure(programs._example(jaxbox.Detections)).num_leaves
         return jax.export.export(jax.jit(lambda *_: [jnp.zeros(())] * num_outputs))(*operands)
 
@@ -88,3 +90,19 @@ def test_settings_that_contradict_each_other_are_refused_though_a_program_is_kep
     with pytest.raises(ValueError, match=r"evidence\.enabled"):
         load(tmp_path, changed("evidence", enabled=False))
     assert not traced
+
+
+def test_the_command_line_keeps_programs_in_its_own_cache_only(traced, tmp_path, monkeypatch):
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path))
+    users = jax.config.values["jax_compilation_cache_dir"]
+    cloud = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY)
+    assert users != str(tmp_path)
+    jax.tree.map(np.testing.assert_array_equal, TimedDetector(BASE)(cloud)[0], found(0))
+    assert not traced
+    try:
+        jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+        programs._load_or_trace.cache_clear()
+        TimedDetector(BASE)(cloud)
+    finally:
+        jax.config.update("jax_compilation_cache_dir", users)
+    assert traced == [CAPACITY]

@@ -1,12 +1,13 @@
 """The detector with a clock: compile time apart from run time."""
 
-import pathlib
+import os
 import time
 
 import jax
 import numpy as np
 
 import jaxbox
+from jaxbox.cli.cache import cache_folder
 from jaxbox.cli.programs import Program, kept_program
 from jaxbox.config import DetectorConfig
 from jaxbox.types import Detections, PointCloud
@@ -15,7 +16,7 @@ from jaxbox.types import Detections, PointCloud
 class TimedDetector:
     """Runs `jaxbox.detect` and times it; the first sweep of each capacity waits for the compiler.
 
-    Where JAX's compilation cache is on, the traced program is kept beside what was compiled of it.
+    Where jaxbox's own cache is on, the traced program is kept beside what was compiled of it.
     """
 
     def __init__(self, config: DetectorConfig) -> None:
@@ -40,10 +41,11 @@ class TimedDetector:
         return time.perf_counter() - start - 2 * again_s
 
     def _program(self, capacity: int) -> Program:
-        folder = jax.config.values["jax_compilation_cache_dir"]
-        if folder is None:
+        folder = cache_folder(os.environ)
+        # A folder that the user gave to JAX is JAX's alone.
+        if folder is None or jax.config.values["jax_compilation_cache_dir"] != str(folder):
             return lambda cloud: jaxbox.detect(cloud, self._config)
-        return kept_program(self._config, capacity=capacity, folder=pathlib.Path(folder))
+        return kept_program(self._config, capacity=capacity, folder=folder)
 
     def _run(self, cloud: PointCloud) -> tuple[Detections, float]:
         start = time.perf_counter()
