@@ -60,25 +60,31 @@ def street(seed: int = 0) -> np.ndarray:
 # The laws.
 
 
-def box_support(detections: Detections, xyz: np.ndarray, margin_m: float) -> np.ndarray:
+def box_support(detections: Detections, xyz: np.ndarray, config: DetectorConfig) -> np.ndarray:
     """How many points of the input each valid box holds, counted apart from the detector.
+
+    Boxes are widened by the margin of the detector, and up and down by the spacing of the beams, by which a
+    top is known no better.
 
     Args:
       detections: of one sweep, on the host.
       xyz: (n, 3) m, the input itself.
-      margin_m: a point so far outside counts.
+      config: the settings.
 
     Returns:
       (K,) int64, of the valid boxes.
     """
     xyz = np.asarray(xyz, np.float64)
     xyz = xyz[np.isfinite(xyz).all(axis=1)]
+    margin_m, grade = float(config.vehicles.margin_m), float(config.vehicles.top_grade)
     held = []
     for row in np.flatnonzero(detections.valid):
         x, y, z = (xyz - np.asarray(detections.center[row], np.float64)).T
         cos, sin = np.cos(float(detections.yaw[row])), np.sin(float(detections.yaw[row]))
         local = np.column_stack([x * cos + y * sin, y * cos - x * sin, z])
-        held.append((np.abs(local) <= detections.size[row] / 2 + margin_m).all(axis=1).sum())
+        spacing_m = grade * np.hypot(*np.asarray(detections.center[row], np.float64)[:2])
+        outside = np.abs(local) - detections.size[row] / 2
+        held.append((outside <= (margin_m, margin_m, margin_m + spacing_m)).all(axis=1).sum())
     return np.array(held, int)
 
 
@@ -105,7 +111,7 @@ def broken_laws(detections: Detections, xyz: np.ndarray, capacity: int, config: 
 def _box_laws(d: Detections, xyz: np.ndarray, config: DetectorConfig) -> dict[str, Any]:
     valid = np.asarray(d.valid)
     share = np.where(d.score[valid] >= DEFAULT_CUT, 1, FAINT_SUPPORT)
-    support = box_support(d, xyz, float(config.vehicles.margin_m)) / config.clustering.min_points
+    support = box_support(d, xyz, config) / config.clustering.min_points
     rows = (d.center, d.size, d.yaw, d.score, d.label, d.num_points, d.hulls.num_vertices)
     return {
         "every box is supported by points of the input": bool((support >= share).all()),

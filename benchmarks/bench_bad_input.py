@@ -40,9 +40,7 @@ def answer(case: bad_input.Case, preset: str, base: DetectorConfig) -> dict[str,
         "boxes": int(found.valid.sum()),
         "boxes_above_cut": int((found.score >= jaxbox.DEFAULT_CUT).sum()),
         "best_score": best,
-        "least_support": int(
-            bad_input.box_support(found, xyz, float(config.vehicles.margin_m)).min(initial=len(xyz))
-        ),
+        "least_support": int(bad_input.box_support(found, xyz, config).min(initial=len(xyz))),
         "counts": {place.name: int(getattr(found.counts, place.name)) for place in places},
         "broken": broken,
     }

@@ -74,10 +74,10 @@ def thin_beams(xyz: np.ndarray, *, num_beams: int, keep_every: int, first: int =
     Raises:
       ValueError: where the points are not in the order of beams, or the numbers make no sense.
 
-    >>> turn = np.radians(np.arange(0, 360, 90))
+    >>> turn = np.radians(np.arange(0, 360, 10))
     >>> sweep = np.tile(np.column_stack([np.cos(turn), np.sin(turn), 0 * turn]), (2, 1))
-    >>> thin_beams(sweep, num_beams=2, keep_every=2, first=1).tolist()
-    [False, False, False, False, True, True, True, True]
+    >>> thin_beams(sweep, num_beams=2, keep_every=2, first=1).nonzero()[0][[0, -1]].tolist()
+    [36, 71]
     """
     if keep_every < 1 or not 0 <= first < keep_every:
         raise ValueError(
