@@ -52,6 +52,11 @@ def _open(file: BinaryIO, compression: str, where: str) -> Any:
     if compression == "lz4":
         return require("lz4.frame", extra="ros", what="Recordings").open(file)
     if compression == "zstd":
-        # Python's own from 3.14 on, and its backport before, as rosbags has it.
-        return require("rosbags.rosbag2.reader", extra="ros", what="Recordings").zstd.open(file)
+        return open_zstd(file)
     raise InputError(f"{where}: the compression {compression!r} is not known; write it with lz4 or zstd.")
+
+
+def open_zstd(file: BinaryIO) -> Any:
+    """What zstd has packed, as a file; it may be several frames."""
+    zstandard = require("zstandard", extra="ros", what="Recordings")
+    return zstandard.ZstdDecompressor().stream_reader(file, read_across_frames=True)

@@ -15,7 +15,7 @@ from typing import Any
 
 from jaxbox.io._extras import require
 from jaxbox.io._files import InputError, check_file, reason
-from jaxbox.io._unpack import unpack
+from jaxbox.io._unpack import open_zstd, unpack
 from jaxbox.io.pointcloud2 import MESSAGE_TYPES, decode_pointcloud2
 from jaxbox.io.points import Points
 from jaxbox.io.recordings import Message, RecordedSweeps, RecordingFormat, choose_topic
@@ -123,7 +123,7 @@ def _check_packed_files(path: pathlib.Path) -> None:
     """Refuses a ROS 2 folder whose packed files would fill the disk, where the library unpacks them."""
     for file in path.glob("*.zstd") if path.is_dir() else ():
         size, bound = 0, _MAX_PACKED_RATIO * file.stat().st_size
-        with require("rosbags.rosbag2.reader", extra="ros", what="ROS bags").zstd.open(file) as packed:
+        with file.open("rb") as handle, open_zstd(handle) as packed:
             while piece := packed.read(_PIECE_BYTES):
                 size += len(piece)
                 if size > bound:
