@@ -201,8 +201,7 @@ def coverage() -> str:
 
 def cluster() -> str:
     """Rates of the workers of a cluster, by their number."""
-    if not (report := recorded("cluster")):
-        return unrecorded("bench_cluster", "cluster")
+    report = load("cluster")
     rows = [
         (text, *(run[name] * scale for run in report["workers"].values()))
         for text, name, scale in CLUSTER_ROWS
@@ -227,22 +226,10 @@ CLUSTER_ROWS = (
 
 def archives() -> str:
     """What archives of some sizes take."""
-    if not (report := recorded("cluster")):
-        return unrecorded("bench_cluster", "cluster")
+    report = load("cluster")
     rows = [(f"{int(size):,}", *row.values()) for size, row in report["archives"].items()]
     columns = [name.replace("_", " ") for name in next(iter(report["archives"].values()))]
     return table(["sweeps", *columns], rows)
-
-
-def recorded(name: str) -> dict[str, Any] | None:
-    """A result, or None where it was not recorded yet."""
-    return load(name) if (RESULTS / f"{name}.json").is_file() else None
-
-
-def unrecorded(benchmark: str, name: str) -> str:
-    """What stands where there is no result yet."""
-    command = f"python -m benchmarks.{benchmark} --json benchmarks/results/{name}.json"
-    return f"*Not recorded yet: `{command}`.*"
 
 
 def beams() -> str:
