@@ -488,7 +488,7 @@ _NUMBERS = (0, 1, 2**7, 2**8, 2**15, 2**16, 2**31 - 1, 2**31, 2**32 - 1)
 
 
 @contextlib.contextmanager
-def prepared(target: Target, root: pathlib.Path) -> Iterator[Callable[[bytes], None]]:
+def prepared(target: Target, root: pathlib.Path) -> Iterator[Callable[[bytes], bool]]:
     """Lends a function that feeds the reader with bytes, by way of a file below a folder.
 
     Args:
@@ -496,15 +496,19 @@ def prepared(target: Target, root: pathlib.Path) -> Iterator[Callable[[bytes], N
       root: an empty folder.
 
     Yields:
-      What reads bytes; it raises what the reader may not, and passes over `jaxbox.io.InputError`.
+      What reads bytes, and tells whether they were read: False for `jaxbox.io.InputError`. It raises what the
+      reader may not.
     """
     path = root / target.file_name
     path.parent.mkdir(parents=True, exist_ok=True)
     target.known(path.parent)
 
-    def read(data: bytes) -> None:
+    def read(data: bytes) -> bool:
         path.write_bytes(data)
-        with contextlib.suppress(io.InputError):
+        try:
             target.read(path)
+        except io.InputError:
+            return False
+        return True
 
     yield read

@@ -7,6 +7,10 @@ import numpy as np
 if TYPE_CHECKING:
     from jaxbox.config import ClusteringConfig, ComponentMap, DetectorConfig, GroundConfig
 
+GROUND_CANDIDATE_CELL_M = 1.0
+"""Cells whose lowest points are candidates for the ground: wide enough that most of them
+near by see the road."""
+
 CAPACITY_STEP = 1024
 """Proposed capacities are multiples of this."""
 

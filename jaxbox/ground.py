@@ -7,14 +7,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxbox.capacities import GROUND_CANDIDATE_CELL_M
 from jaxbox.masked import apart, compact, lookup
 from jaxbox.types import GroundPlane
 
 HYPOTHESES_AT_A_TIME = 32
 """Planes tried together: few enough for their residuals to stay in the cache."""
-
-CANDIDATE_CELL_M = 1.0
-"""Cells whose lowest points are candidates: wide enough that most cells near by see the road."""
 
 FAR_FILL_WIDTH = 4
 """How much wider the wide Gaussian is, which fills where the narrow one has no ground cell."""
@@ -55,17 +53,17 @@ def cell_minima(
 
     Reference: oracle `jaxbox.reference.cell_minima`.
     """
-    columns = round(2 * half_y_m / CANDIDATE_CELL_M)
-    rows = round(2 * half_x_m / CANDIDATE_CELL_M)
+    columns = round(2 * half_y_m / GROUND_CANDIDATE_CELL_M)
+    rows = round(2 * half_x_m / GROUND_CANDIDATE_CELL_M)
     inside = mask & (jnp.abs(xyz[:, 0]) < half_x_m) & (jnp.abs(xyz[:, 1]) < half_y_m)
-    i = jnp.floor((xyz[:, 0] + half_x_m) / CANDIDATE_CELL_M).astype(jnp.int32)
-    j = jnp.floor((xyz[:, 1] + half_y_m) / CANDIDATE_CELL_M).astype(jnp.int32)
+    i = jnp.floor((xyz[:, 0] + half_x_m) / GROUND_CANDIDATE_CELL_M).astype(jnp.int32)
+    j = jnp.floor((xyz[:, 1] + half_y_m) / GROUND_CANDIDATE_CELL_M).astype(jnp.int32)
     cell = jnp.where(inside, i * columns + j, rows * columns)
     lowest = jnp.full(rows * columns, jnp.inf).at[cell].min(xyz[:, 2], mode="drop")
     occupied = jnp.isfinite(lowest)
     index = jnp.arange(rows * columns)
-    x = (index // columns + 0.5) * CANDIDATE_CELL_M - half_x_m
-    y = (index % columns + 0.5) * CANDIDATE_CELL_M - half_y_m
+    x = (index // columns + 0.5) * GROUND_CANDIDATE_CELL_M - half_x_m
+    y = (index % columns + 0.5) * GROUND_CANDIDATE_CELL_M - half_y_m
     candidates = jnp.stack([x, y, jnp.where(occupied, lowest, 0)], axis=1)
     return candidates, occupied
 

@@ -3,6 +3,7 @@
 All on the host, from what `detect` returns anyway; `jaxbox.Detections.summary` is the way in.
 """
 
+import collections
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -10,14 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jaxbox.capacities import GROUND_CANDIDATE_CELL_M
 from jaxbox.config import DEFAULT_CUT, DetectorConfig
 from jaxbox.types import NUM_POINT_COUNTS, Counts, GroundPlane, Label, Status
 
 if TYPE_CHECKING:
     from jaxbox.types import Detections
-
-CANDIDATE_CELL_M = 1.0
-"""Cells whose lowest points are candidates for the ground, as in `jaxbox.ground`."""
 
 POINT_PLACES = tuple(field.name for field in dataclasses.fields(Counts)[:NUM_POINT_COUNTS])
 """Where a point can be, see `Counts`; each is in exactly one."""
@@ -96,6 +95,24 @@ class GroundSummary:
             inliers=inliers,
             inlier_share=inliers / _num_candidates(config),
         )
+
+
+def classes_in_words(labels: np.ndarray) -> str:
+    """How many of each class there are.
+
+    Args:
+      labels: (k,) int, of `Label`.
+
+    Returns:
+      Words; empty for none.
+
+    >>> classes_in_words(np.array([0, 1, 0, 0]))
+    '3 cars, 1 van'
+    """
+    counts = collections.Counter(Label(label) for label in labels.tolist())
+    return ", ".join(
+        f"{counts[label]} {label.name.lower()}{'s' * (counts[label] > 1)}" for label in Label if counts[label]
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -213,5 +230,5 @@ def _num_candidates(config: DetectorConfig) -> int:
     ground = config.ground
     if ground.candidates == "points":
         return ground.num_candidates
-    across = (2 * half / CANDIDATE_CELL_M for half in (ground.candidate_half_x_m, ground.candidate_half_y_m))
-    return math.prod(round(cells) for cells in across)
+    halves_m = (ground.candidate_half_x_m, ground.candidate_half_y_m)
+    return math.prod(round(2 * half_m / GROUND_CANDIDATE_CELL_M) for half_m in halves_m)

@@ -93,8 +93,6 @@ def test_two_jobs_write_the_files_of_one_though_a_worker_is_killed(street, alone
 
 def test_ctrl_c_ends_the_workers_and_what_is_done_is_whole(street, alone, tmp_path, monkeypatch):
     write = Results.write
-    # A process that was started in the background ignores Ctrl-C.
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def interrupted(self, sweep, *arguments, **options):
         record = write(self, sweep, *arguments, **options)
@@ -104,10 +102,14 @@ def test_ctrl_c_ends_the_workers_and_what_is_done_is_whole(street, alone, tmp_pa
             os.kill(os.getpid(), signal.SIGINT)
         return record
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Results, "write", interrupted)
-        result = run("detect", street, "--output", tmp_path, *COMMON, "--jobs", "2")
-    signal.signal(signal.SIGINT, before)
+    # A process that was started in the background ignores Ctrl-C.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with monkeypatch.context() as patch:
+            patch.setattr(Results, "write", interrupted)
+            result = run("detect", street, "--output", tmp_path, *COMMON, "--jobs", "2")
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert result.exit_code == 1
     assert "--resume goes on" in result.stderr
     assert "worker" not in result.stderr

@@ -14,7 +14,7 @@ import pytest
 import viser
 from test_cli import run
 from test_detector import street
-from viewer_sweeps import write_kitti
+from viewer_sweeps import write_kitti, write_three_streets
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -54,12 +54,7 @@ WAIT_S = 120
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """Three streets of KITTI's layout; the second one's points are cut off."""
-    root = tmp_path_factory.mktemp("streets") / "training"
-    for seed in range(3):
-        grey = np.full((375, 1242, 3), 90, np.uint8)
-        write_kitti(root, f"{seed:06d}", dataclasses.replace(street(seed), image=grey))
-    (root / "velodyne" / "000001.bin").write_bytes(b"cut off")
-    return root
+    return write_three_streets(tmp_path_factory.mktemp("streets") / "training")
 
 
 @pytest.fixture(scope="module")
@@ -442,6 +437,7 @@ def test_playing_goes_round(started):
     # Past the broken one and the end, twice.
     page.wait_for("000002", count=2)
     page.wait_for("000001.bin", count=2)
+    assert viewer.wanted.playing
     viewer.want(playing=False)
 
 

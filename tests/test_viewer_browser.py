@@ -1,13 +1,12 @@
 """The viewer in a real browser: ``pytest -m browser``, with Chromium installed."""
 
-import dataclasses
 import threading
 
 import numpy as np
 import pytest
 from browser import LOOPBACK, WAIT_S, chromium
 from test_detector import street
-from viewer_sweeps import write_kitti
+from viewer_sweeps import write_three_streets
 
 from jaxbox import DetectorConfig, PointCloud, detect, io
 from jaxbox.settings import settings_from_toml
@@ -26,11 +25,7 @@ VIEW_PX = (370, 610)
 @pytest.fixture(scope="module")
 def served(tmp_path_factory):
     """A viewer on three streets, the second of which cannot be read, and the address of its page."""
-    root = tmp_path_factory.mktemp("streets") / "training"
-    for seed in range(3):
-        grey = np.full((375, 1242, 3), 90, np.uint8)
-        write_kitti(root, f"{seed:06d}", dataclasses.replace(street(seed), image=grey))
-    (root / "velodyne" / "000001.bin").write_bytes(b"cut off")
+    root = write_three_streets(tmp_path_factory.mktemp("streets") / "training")
     with open_viewer(io.open_sweeps(root), wanted=Wanted(view=View(min_score=SHOWN))) as (viewer, url):
         thread = threading.Thread(target=viewer.run)
         thread.start()

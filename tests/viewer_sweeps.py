@@ -3,6 +3,9 @@
 import dataclasses
 import pathlib
 
+import numpy as np
+from test_detector import street
+
 from jaxbox import Label, io
 from jaxbox.synthetic import SyntheticSweep
 from jaxbox.viz import save_png
@@ -24,3 +27,12 @@ def write_kitti(
     if sweep.image is not None:
         save_png(folder / "image_2" / f"{name}.png", sweep.image)
     return folder
+
+
+def write_three_streets(root: pathlib.Path) -> pathlib.Path:
+    """Three sparse streets with grey images; the second one's points are cut off."""
+    for seed in range(3):
+        grey = np.full((375, 1242, 3), 90, np.uint8)
+        write_kitti(root, f"{seed:06d}", dataclasses.replace(street(seed), image=grey))
+    (root / "velodyne" / "000001.bin").write_bytes(b"cut off")
+    return root

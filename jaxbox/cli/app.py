@@ -57,6 +57,11 @@ SetOption = Annotated[
 DrivesOption = Annotated[
     pathlib.Path | None, typer.Option(help='Text file of the drive of each frame: "frame drive" a line.')
 ]
+TopicOption = Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")]
+CapacityOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="Points a sweep is padded to; by default what it needs. One compile each."),
+]
 
 
 class Engine(enum.StrEnum):
@@ -164,7 +169,7 @@ def detect(
             help="What to write; repeatable. both: kitti and jsonl. By default kitti, or with ray parquet.",
         ),
     ] = None,
-    topic: Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")] = None,
+    topic: TopicOption = None,
     sensor_at: Annotated[
         tuple[float, float, float] | None,
         typer.Option(metavar="X Y Z", help="Where the sensor is in the points' frame (m), if not at 0 0 0."),
@@ -172,10 +177,7 @@ def detect(
     level: Annotated[
         bool, typer.Option("--level", help="Measure how the sensor is tilted, and see the sweeps upright.")
     ] = False,
-    capacity: Annotated[
-        int | None,
-        typer.Option(min=1, help="Points a sweep is padded to; by default what it needs. One compile each."),
-    ] = None,
+    capacity: CapacityOption = None,
     min_score: Annotated[
         float,
         typer.Option(
@@ -394,7 +396,7 @@ def info(
         list[str] | None, typer.Argument(help="What `detect` takes; none for versions and presets.")
     ] = None,
     *,
-    topic: Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")] = None,
+    topic: TopicOption = None,
     num_sweeps: Annotated[
         int, typer.Option("--sweeps", min=1, help="Sweeps to look at, spread over all there are.")
     ] = 1,
@@ -425,11 +427,8 @@ def view(
     sensor: SensorOption = None,
     settings: SettingsOption = None,
     changes: SetOption = None,
-    topic: Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")] = None,
-    capacity: Annotated[
-        int | None,
-        typer.Option(min=1, help="Points a sweep is padded to; by default what it needs. One compile each."),
-    ] = None,
+    topic: TopicOption = None,
+    capacity: CapacityOption = None,
     min_score: Annotated[
         float,
         typer.Option(min=0.0, max=1.0, help="Boxes that score less are hidden at first."),

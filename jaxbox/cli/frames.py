@@ -21,7 +21,6 @@ from jaxbox.workers import ProcessPool, ahead
 
 SHOWN_PICTURES = ("boxes", "lidar", "image")
 """Of the pictures of the stages, those that show the answer."""
-VEHICLE_TYPES = ("Car", "Van", "Truck")
 DONT_CARE_SHARE = 0.5
 """A box with a larger share of its 2D box in one DontCare region is not judged."""
 
@@ -172,7 +171,7 @@ def _write_pictures(
         cloud,
         detections,
         calibration=calibration,
-        image=sweep.read_image(),
+        image=sweep.read_image() if read.image is None else read.image,
         truth=truth,
         judged=judged,
         min_score=min_score,
@@ -184,7 +183,7 @@ def _write_pictures(
 
 def label_boxes(labels: Iterable[io.KittiObject], calibration: Calibration) -> BoxSet:
     """The labelled vehicles, in the sensor frame."""
-    vehicles = [label for label in labels if label.type in VEHICLE_TYPES]
+    vehicles = [label for label in labels if label.type in io.VEHICLE_TYPES]
     center, size, yaw = io.boxes_from_objects(vehicles, calibration)
     return BoxSet(center=center, size=size, yaw=yaw)
 

@@ -1,14 +1,14 @@
 """What the commands say about a sweep, a run and its boxes, in words and tables."""
 
 import dataclasses
-from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from rich.table import Table
 
 from jaxbox.config import DEFAULT_CUT
-from jaxbox.types import Detections, Label, Status
+from jaxbox.summary import classes_in_words
+from jaxbox.types import Detections, Status
 
 SHOWN_MIN_SCORE = DEFAULT_CUT
 """Boxes that score less are written but not drawn or counted as found: most of them are no vehicle."""
@@ -100,11 +100,7 @@ def describe_frame(report: FrameReport, *, min_score: float = SHOWN_MIN_SCORE) -
 def count_classes(detections: Detections, *, min_score: float) -> str:
     """Boxes a class, in words: '3 cars, 1 van', or 'no vehicle'."""
     keep = np.asarray(detections.valid) & (np.asarray(detections.score) >= min_score)
-    counts = Counter(Label(label) for label in np.asarray(detections.label)[keep].tolist())
-    parts = [
-        f"{counts[label]} {label.name.lower()}{'s' * (counts[label] > 1)}" for label in Label if counts[label]
-    ]
-    return ", ".join(parts) or "no vehicle"
+    return classes_in_words(np.asarray(detections.label)[keep]) or "no vehicle"
 
 
 def describe_run(run: RunReport) -> list[str]:

@@ -12,6 +12,7 @@ from jaxbox.io.drives import read_drives
 from jaxbox.io.images import read_image
 from jaxbox.io.jsonl import detections_record, read_jsonl, write_jsonl
 from jaxbox.io.kitti import (
+    VEHICLE_TYPES,
     KittiObject,
     boxes_from_objects,
     objects_from_boxes,
@@ -39,6 +40,7 @@ from jaxbox.io.sweeps import RECORDING_SUFFIXES, open_sweeps
 __all__ = [
     "POINT_SUFFIXES",
     "RECORDING_SUFFIXES",
+    "VEHICLE_TYPES",
     "InputError",
     "KittiObject",
     "LabelledBoxes",

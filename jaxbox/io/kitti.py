@@ -30,6 +30,8 @@ _OBJECT_COLUMNS = (15, 16)
 _TRACKING_COLUMNS = (17, 18)
 
 DONT_CARE = "DontCare"
+VEHICLE_TYPES = tuple(label.name.capitalize() for label in Label)
+"""Types of the objects that the detector looks for."""
 
 MIN_VISIBLE_FRACTION = 0.3
 """Boxes with less of their 2D box in the image are no answer: the labels hold what the image shows."""

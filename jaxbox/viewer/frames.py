@@ -14,8 +14,6 @@ from jaxbox.viz import BoxSet
 
 _T = TypeVar("_T")
 
-VEHICLE_TYPES = ("Car", "Van", "Truck")
-"""Labels of what the detector looks for."""
 FAR_M = 1000.0
 """Points farther along an axis are errors of the sensor, and would make the scene too large to draw."""
 
@@ -158,5 +156,5 @@ def _label_boxes(
     objects = [label for label in labels if not label.is_dont_care]
     center, size, yaw = io.boxes_from_objects(objects, calibration)
     boxes = BoxSet(center=center, size=size, yaw=yaw, captions=tuple(label.type for label in objects))
-    is_vehicle = np.array([label.type in VEHICLE_TYPES for label in objects], bool)
+    is_vehicle = np.array([label.type in io.VEHICLE_TYPES for label in objects], bool)
     return boxes.take(is_vehicle), boxes.take(~is_vehicle)

@@ -3,13 +3,13 @@
 import base64
 import datetime
 import html
-from collections import Counter
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
-from jaxbox.types import Detections, Label, Status
+from jaxbox.summary import classes_in_words
+from jaxbox.types import Detections, Status
 from jaxbox.viewer.frames import Frame
 from jaxbox.viewer.session import Session, Shown
 
@@ -50,7 +50,7 @@ def describe(shown: Shown, session: Session, *, index: int, min_score: float) ->
         [
             _heading(frame, index, len(session)),
             f"<b><span data-jaxbox='vehicles'>{int(keep.sum())}</span> {noun}</b>: "
-            f"{_classes(shown.detections, keep)}",
+            f"{classes_in_words(np.asarray(shown.detections.label)[keep]) or 'none'}",
             _quiet(f"{total} boxes of any score in the answer"),
             f"<b><span data-jaxbox='milliseconds'>{shown.detect_s * 1e3:.1f}</span> ms</b> to detect, "
             f"{frame.read_s * 1e3:.0f} ms to read {frame.num_points:,} points",
@@ -195,11 +195,3 @@ def _heading(frame: Frame, index: int, count: int) -> str:
 
 def _keep(detections: Detections, min_score: float) -> np.ndarray:
     return np.asarray(detections.valid) & (np.asarray(detections.score, np.float64) >= min_score)
-
-
-def _classes(detections: Detections, keep: np.ndarray) -> str:
-    counts = Counter(Label(label) for label in np.asarray(detections.label)[keep].tolist())
-    parts = [
-        f"{counts[label]} {label.name.lower()}{'s' * (counts[label] > 1)}" for label in Label if counts[label]
-    ]
-    return ", ".join(parts) or "none"
