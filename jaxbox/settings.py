@@ -8,6 +8,7 @@ dotted key reaches one value. `settings_to_toml` writes such a text, `settings_f
 """
 
 import ast
+import contextlib
 import dataclasses
 import difflib
 import json
@@ -269,6 +270,28 @@ def changed_settings(config: DetectorConfig, base: DetectorConfig) -> dict[str, 
     """
     values = {name: leaf.value for name, leaf in _leaves(base)}
     return {name: leaf.value for name, leaf in _leaves(config) if leaf.value != values.get(name, leaf)}
+
+
+def differing_names(
+    config: DetectorConfig, options: Mapping[str, Any], *, earlier: DetectorConfig, account: str | bytes
+) -> list[str]:
+    """Names of the settings and options in which a run differs from an earlier one that it would go on with.
+
+    Args:
+      config: the settings now.
+      options: other options that the results depend on, now.
+      earlier: the settings then.
+      account: JSON that the earlier run left, with its options under "options"; where it is broken, only
+        the settings are compared.
+
+    Returns:
+      Dotted names and names of options; empty where nothing differs.
+    """
+    names = list(changed_settings(earlier, config))
+    with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        recorded = json.loads(account)["options"]
+        names += [name for name, value in options.items() if recorded.get(name) != value]
+    return names
 
 
 def parse_change(text: str) -> tuple[str, Any]:

@@ -20,7 +20,7 @@ from jaxbox.io.parquet import PARQUET
 from jaxbox.io.points import Points
 from jaxbox.io.rerun import RERUN
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
-from jaxbox.settings import changed_settings
+from jaxbox.settings import differing_names
 from jaxbox.types import Calibration, Detections
 from jaxbox.versions import versions
 
@@ -193,12 +193,8 @@ class RunAccount:
         if not (self.output / CONFIG_NAME).is_file():
             return
         earlier = io.read_config(self.output / CONFIG_NAME, base=self.config)
-        differing = list(changed_settings(earlier, self.config))
-        with contextlib.suppress(
-            ValueError, TypeError, KeyError, AttributeError, RecursionError, io.InputError
-        ):
-            options = json.loads((self.output / RUN_NAME).read_text("utf-8"))["options"]
-            differing += [name for name, value in self.options.items() if options.get(name) != value]
+        account = (self.output / RUN_NAME).read_bytes()
+        differing = differing_names(self.config, self.options, earlier=earlier, account=account)
         if differing:
             raise io.InputError(
                 f"{self.output / CONFIG_NAME}: --resume needs the settings of the earlier run, and "

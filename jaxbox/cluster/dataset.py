@@ -22,7 +22,7 @@ from jaxbox.cluster.store import Store
 from jaxbox.cluster.worker import REPORT_KEY, SUFFIX, Partition, PartitionWorker, Task, is_attempt
 from jaxbox.config import DetectorConfig
 from jaxbox.io._extras import require
-from jaxbox.settings import changed_settings, settings_from_toml, settings_to_toml
+from jaxbox.settings import differing_names, settings_from_toml, settings_to_toml
 from jaxbox.steps import check_settings
 from jaxbox.versions import versions
 
@@ -259,10 +259,8 @@ class _Run:
             earlier = settings_from_toml(text, base=self.task.config)
         except ValueError as error:
             raise io.InputError(f"{self.task.output}/{CONFIG}: {error}; give another output.") from error
-        differing = list(changed_settings(earlier, self.task.config))
-        with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError):
-            options = json.loads(self._store.read_text(MANIFEST) or "")["options"]
-            differing += [name for name, value in self._options.items() if options.get(name) != value]
+        account = self._store.read_text(MANIFEST) or ""
+        differing = differing_names(self.task.config, self._options, earlier=earlier, account=account)
         if differing:
             raise io.InputError(
                 f"{self.task.output}: an earlier run had other settings: {', '.join(differing)} differ. Give "

@@ -41,7 +41,7 @@ class Store:
     def read_text(self, name: str) -> str | None:
         """The text of a file, or None where there is none."""
         try:
-            return self._system.cat_file(self._path(name)).decode("utf-8")
+            return self._system.cat_file(self._path(name)).decode("utf-8", "replace")
         except FileNotFoundError:
             return None
 
