@@ -303,10 +303,12 @@ class VehicleConfig:
     """A point this far outside a box still counts as inside."""
     ring_m: Scalar = 0.5
     """A point farther outside than the margin but nearer than this speaks against the box."""
-    top_margin_m: Scalar = 0.04
-    """Added to the highest return: beams seldom meet the very top."""
+    stray_share: Scalar = 0.01
+    """Share of the points in a box that may lie above its top: a single return in the air is no roof."""
+    top_margin_m: Scalar = 0.03
+    """Added to the top of the points: beams seldom meet the very top."""
     top_grade: Scalar = 0.0075
-    """A top may be higher than its highest return by this times the range: the beams' spacing."""
+    """A top may be higher than that of its points by this times the range: the beams' spacing."""
     min_extent_m: Scalar = 1.0
     """Boxes with both measured extents shorter than this are no vehicle."""
     saturation_points: Scalar = 100.0

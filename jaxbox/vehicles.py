@@ -28,7 +28,13 @@ COUNT_BITS = BLOCK_POINTS.bit_length()
 """Bits that hold a count of the points of a block."""
 
 NUM_KINDS = 5
-"""Kinds of points that are counted."""
+"""Kinds of points that are counted, and counts in a word of the bits of all."""
+
+NUM_LEVELS = 20
+"""Levels of height in which the points inside are counted, up to the highest that a vehicle's may have."""
+
+LOWEST_LEVEL = 0.4
+"""Where the levels begin, as a share of that height: no vehicle's top is lower."""
 
 DOUBT_POINTS = 5
 """So many upper points, with the share of full worth behind the faces, are taken for granted: of few
@@ -49,7 +55,7 @@ class Surroundings:
     num_inside: jax.Array
     """(P,) float32: points of vehicle height inside, give or take the margin."""
     top: jax.Array
-    """(P,) float32, m above the ground: the highest of them; 0 where there are none."""
+    """(P,) float32, m above the ground: as high as all but a few of them; 0 where there are none."""
     num_above: jax.Array
     """(P,) float32: points higher than the vehicle, within the box."""
     num_ring: jax.Array
@@ -74,6 +80,7 @@ def count_points_around(
     margin_m: jax.Array | float,
     ring_m: jax.Array | float,
     upper_height_m: jax.Array | float,
+    stray_share: jax.Array | float,
 ) -> Surroundings:
     """Counts the points of the whole sweep in and round each box.
 
@@ -90,6 +97,8 @@ def count_points_around(
       margin_m: a point this far outside still counts as inside, m.
       ring_m: a point farther out than the margin and nearer than this is in the ring, m.
       upper_height_m: points higher than this are glass, bonnet and roof, m.
+      stray_share: share of the points inside that may lie above the top: a single return in the air is no
+        roof. 0 makes the highest point the top.
 
     Returns:
       The counts; zero for chunks of boxes beyond `num_boxes`.
@@ -122,7 +131,10 @@ def count_points_around(
         row = jnp.minimum(i, shape[0] - 1) * shape[1]
         first, after = begin[row + low[1][:, None]], end[row + high[1][:, None]]
         length = jnp.where(i <= high[0][:, None], after - first, 0)
-        return _count_runs(frames, first, length, points, margin_m, ring_m, upper_height_m)
+        counts, highest = _count_runs(frames, first, length, points, margin_m, ring_m, upper_height_m)
+        inside, above, ring, upper, recessed = counts[:, :NUM_KINDS].T
+        top = _top(highest, stray_share * inside, counts[:, NUM_KINDS:], frames[:, -1])
+        return Surroundings(inside, top, above, ring, upper, recessed)
 
     return map_rows(look, (frames, low, high), num_rows=num_boxes, chunk=BOX_CHUNK)
 
@@ -148,8 +160,13 @@ def _count_runs(
     margin_m: jax.Array | float,
     ring_m: jax.Array | float,
     upper_height_m: jax.Array | float,
-) -> Surroundings:
-    """Counts over runs of neighbouring points, some for each box, (C, runs): block after block of them."""
+) -> tuple[jax.Array, jax.Array]:
+    """Counts over runs of neighbouring points, some for each box, (C, runs): block after block of them.
+
+    Returns:
+      counts: (C, kinds + levels) float32.
+      highest: (C,) float32, m.
+    """
     num_boxes, runs = first.shape
     first, length = first.reshape(-1), length.reshape(-1)
     num_blocks = (length + BLOCK_POINTS - 1) // BLOCK_POINTS
@@ -174,17 +191,16 @@ def _count_runs(
             return jax.vmap(piece)(first[run] + offset)
 
         there = jnp.arange(BLOCK_POINTS) < left[:, None]
-        kinds, top = _judge(
+        words, highest = _judge(
             frames[box], there, [block(column) for column in points], margin_m, ring_m, upper_height_m
         )
-        counts = (kinds[:, None] >> jnp.arange(NUM_KINDS) * COUNT_BITS) & (2**COUNT_BITS - 1)
-        return state[0].at[box].add(counts), state[1].at[box].max(top)
+        counts = (words[:, :, None] >> jnp.arange(NUM_KINDS) * COUNT_BITS) & (2**COUNT_BITS - 1)
+        return state[0].at[box].add(counts.reshape(LOOKUP_BLOCKS, -1)), state[1].at[box].max(highest)
 
     steps = (end[-1] + LOOKUP_BLOCKS - 1) // LOOKUP_BLOCKS
-    none = jnp.zeros((num_boxes, NUM_KINDS), jnp.int32), jnp.zeros(num_boxes)
-    counts, top = jax.lax.fori_loop(0, steps, step, none)
-    inside, above, ring, upper, recessed = counts.astype(jnp.float32).T
-    return Surroundings(inside, top, above, ring, upper, recessed)
+    none = jnp.zeros((num_boxes, NUM_KINDS + NUM_LEVELS), jnp.int32), jnp.zeros(num_boxes)
+    counts, highest = jax.lax.fori_loop(0, steps, step, none)
+    return counts.astype(jnp.float32), highest
 
 
 def _judge(
@@ -195,7 +211,10 @@ def _judge(
     ring_m: jax.Array | float,
     upper_height_m: jax.Array | float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Counts of each kind of point in blocks (B, L) of them, packed in one word, and the highest inside."""
+    """Counts of points in blocks (B, L) of them, packed in words (B, W), and the highest inside (B,).
+
+    The first word holds each kind of point, and the others each level of height of those inside.
+    """
     box_x, box_y, cos, sin, half_l, half_w, facing_u, facing_v, face_u, face_v, max_height = (
         frames[:, k, None] for k in range(frames.shape[1])
     )
@@ -208,10 +227,26 @@ def _judge(
     recessed = upper & (jnp.minimum(face_u - facing_u * u, face_v - facing_v * v) > 0)
     # One sum counts all kinds, each in its own bits.
     kinds = (inside & low, inside & ~low, ~inside & (out < ring_m) & low, upper, recessed)
-    word = sum(jnp.where(kind, 1 << k * COUNT_BITS, 0) for k, kind in enumerate(kinds))
+    words = [sum(jnp.where(kind, 1 << k * COUNT_BITS, 0) for k, kind in enumerate(kinds))]
+    share = height / max_height - LOWEST_LEVEL
+    level = jnp.minimum(share * (NUM_LEVELS / (1 - LOWEST_LEVEL)), NUM_LEVELS - 1).astype(jnp.int32)
+    level = jnp.where(inside & low & (share > 0), level, NUM_LEVELS)
+    bit, word = 1 << level % NUM_KINDS * COUNT_BITS, level // NUM_KINDS
+    words += [jnp.where(word == k, bit, 0) for k in range(NUM_LEVELS // NUM_KINDS)]
     # Heights are not negative, and the bits of such numbers are in their order: integers' maxima vectorise.
-    top = jax.lax.bitcast_convert_type(jnp.where(inside & low, height, 0), jnp.int32)
-    return jnp.sum(word, axis=1), jax.lax.bitcast_convert_type(jnp.max(top, axis=1), jnp.float32)
+    highest = jax.lax.bitcast_convert_type(jnp.where(inside & low, height, 0), jnp.int32)
+    counts = jnp.stack([jnp.sum(word, axis=1) for word in words], axis=1)
+    return counts, jax.lax.bitcast_convert_type(jnp.max(highest, axis=1), jnp.float32)
+
+
+def _top(highest: jax.Array, num_stray: jax.Array, levels: jax.Array, max_height: jax.Array) -> jax.Array:
+    """(P,) the height that so many points exceed, evenly spread within their level (P, levels)."""
+    higher = jnp.cumsum(levels[:, ::-1], axis=1)[:, ::-1] - levels
+    num_stray = num_stray[:, None]
+    is_top = (higher <= num_stray) & (num_stray < higher + levels)
+    above = jnp.arange(NUM_LEVELS, 0, -1) - 1 + (num_stray - higher) / jnp.maximum(levels, 1)
+    share = jnp.sum(jnp.where(is_top, 1 - above * ((1 - LOWEST_LEVEL) / NUM_LEVELS), 0), axis=1)
+    return jnp.where(jnp.any(is_top, axis=1), jnp.minimum(share * max_height, highest), highest)
 
 
 def bell(
@@ -310,7 +345,7 @@ def surroundings_score(
 ) -> jax.Array:
     """The part of the score that the points in and round the box decide.
 
-    The true top lies between the highest return and that plus the beams' spacing; it is held against the
+    The true top lies between the top of the points and that plus the beams' spacing; it is held against the
     class at the place in between that suits it best.
 
     Args:
@@ -321,7 +356,7 @@ def surroundings_score(
       height_above_m: (P,) float32, m, above the prior.
       min_height_m: (P,) float32, m: lower tops are no such vehicle.
       max_height_m: (P,) float32, m: higher tops are no such vehicle.
-      top_grade: how much higher than the highest return the top may be, m per m of range.
+      top_grade: how much higher than the points the top may be, m per m of range.
       ring_weight: exp(-weight ring / inside).
       overhead_weight: exp(-weight above / inside).
       recess_share: full worth from this share of the upper points behind the faces on.

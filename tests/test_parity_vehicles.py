@@ -10,7 +10,7 @@ import parity
 from jaxbox import geometry, reference, vehicles
 
 SETTINGS = parity.CONFIG.vehicles
-AROUND = parity.select_options(SETTINGS, "margin_m", "ring_m", "upper_height_m")
+AROUND = parity.select_options(SETTINGS, "margin_m", "ring_m", "upper_height_m", "stray_share")
 SCORE = parity.select_options(
     SETTINGS,
     *("top_grade", "min_extent_m", "saturation_points", "sparseness_power", "free_scale", "ring_weight"),
@@ -71,7 +71,7 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
             len(xy),
         )
         around = parity.on_host(around)
-        wrong, seen = 0, 0
+        wrong, seen, tops_m = 0, 0, []
         for row, box in enumerate(boxes.astype(float)):
             expected = reference.count_points_around(
                 box,
@@ -94,9 +94,13 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
             )
             ours = np.array([count[row] for count in counts])
             wrong, seen = wrong + np.abs(ours - theirs).sum(), seen + theirs.sum()
-            assert around.top[row] == np.float32(expected.top_m) or np.any(ours != theirs)
+            tops_m.append((around.top[row], expected.top_m))
         # A point on the edge of a box may round to either side of it.
         parity.assert_share(wrong, seen, 1e-4, "points round boxes")
+        # A height on the edge of a level may round to either side of it.
+        ours_m, theirs_m = np.transpose(tops_m)
+        off = np.abs(ours_m - theirs_m) > 1e-4
+        parity.assert_share(off.sum(), len(off), 0.02, "tops")
 
 
 @jax.jit

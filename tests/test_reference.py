@@ -10,6 +10,7 @@ from scipy import sparse, spatial
 
 from jaxbox import reference
 from jaxbox.config import CompletionConfig, DetectorConfig, EvidenceConfig, GroundConfig, VehicleConfig
+from jaxbox.reference.vehicles import top_of
 from jaxbox.types import NUM_POINT_COUNTS, Counts, Label
 
 SENSOR_HEIGHT_M = 1.73
@@ -68,6 +69,7 @@ AROUND = {
     "max_height_m": 4.0,
     "recess_m": 0.3,
     "upper_height_m": 0.9,
+    "stray_share": 0.0,
 }
 
 
@@ -661,6 +663,26 @@ def test_upper_points_behind_the_faces_are_recessed():
     xyz = np.array([[8.0, 0, 0], [8.2, 0, 0], [8.4, 0, 0], [9.0, 0, 0], [9.0, 0, 0]])
     around = reference.count_points_around(box, xyz, np.array([1.0, 1.0, 1.0, 1.4, 0.6]), **AROUND)
     assert (around.upper, around.recessed) == (4, 2)
+
+
+def test_a_few_stray_returns_above_a_roof_are_not_its_top():
+    roof = np.random.default_rng(0).uniform(0.3, 1.5, 400)
+    options = {"max_height_m": 2.2, "stray_share": 0.01}
+    highest = options | {"stray_share": 0.0}
+    assert top_of(roof, **highest) == roof.max()
+    clean = top_of(roof, **options)
+    assert abs(clean - np.quantile(roof, 0.99)) < 0.02
+    for num_stray in (1, 2, 4):
+        with_strays = np.append(roof, np.linspace(1.8, 2.1, num_stray))
+        assert top_of(with_strays, **highest) == with_strays.max()
+        assert clean <= top_of(with_strays, **options) < roof.max() + 0.07
+
+
+def test_the_top_of_few_points_is_within_a_level_of_the_highest():
+    for height in ([1.4], [0.5, 0.6], [0.3, 1.0, 1.41]):
+        top = top_of(np.array(height), 2.2, 0.01)
+        assert max(height) - 0.6 * 2.2 / 20 < top <= max(height)
+    assert top_of(np.empty(0), 2.2, 0.01) == 0
 
 
 PERFECT = {

@@ -319,7 +319,7 @@ def _judge(
         box,
         obstacles.xyz[near],
         obstacles.height[near],
-        **select_options(vehicles, "margin_m", "ring_m", "upper_height_m"),
+        **select_options(vehicles, "margin_m", "ring_m", "upper_height_m", "stray_share"),
         **select_options(settings.ground, "min_height_m", "max_height_m"),
         count_max_height_m=prior.count_max_height_m,
         recess_m=prior.recess_m,

@@ -11,6 +11,12 @@ from jaxbox.class_priors import ClassPrior
 DOUBT_POINTS = 5
 """So many upper points, with the share of full worth behind the faces, are taken for granted."""
 
+NUM_LEVELS = 20
+"""Levels of height by which the top is found,"""
+
+LOWEST_LEVEL = 0.4
+"""from this share of the highest that points of the vehicle may have."""
+
 
 @dataclasses.dataclass(frozen=True)
 class PointsAround:
@@ -19,7 +25,7 @@ class PointsAround:
     inside: int
     """Points of the vehicle's heights within the box and its margin."""
     top_m: float
-    """Highest of them above the ground; 0 without any."""
+    """As high above the ground as all but a few of them, see `top_of`; 0 without any."""
     overhead: int
     """Higher points within the box and its margin."""
     ring: int
@@ -59,6 +65,7 @@ def count_points_around(
     max_height_m: float,
     recess_m: float,
     upper_height_m: float,
+    stray_share: float,
 ) -> PointsAround:
     """Counts the points in and round a box.
 
@@ -73,6 +80,7 @@ def count_points_around(
       max_height_m: and from this on they are left out.
       recess_m: recessed points lie farther than this behind each face that the sensor sees.
       upper_height_m: points higher than this are glass, bonnet and roof.
+      stray_share: share of the points inside that may lie above the top.
 
     Returns:
       The counts.
@@ -84,12 +92,36 @@ def count_points_around(
     upper = within & counted & (height > upper_height_m)
     return PointsAround(
         inside=int((within & counted).sum()),
-        top_m=float(np.max(height, where=within & counted, initial=0.0)),
+        top_m=top_of(height[within & counted], count_max_height_m, stray_share),
         overhead=int((within & above).sum()),
         ring=int((~within & (outside < ring_m) & counted).sum()),
         upper=int(upper.sum()),
         recessed=int((upper & (depth_behind_faces(xyz[:, :2], box) > recess_m)).sum()),
     )
+
+
+def top_of(height: np.ndarray, max_height_m: float, stray_share: float) -> float:
+    """The height that a share of the points of a vehicle exceed, so that a stray return is no roof.
+
+    Args:
+      height: (n,) m above the ground, below the next.
+      max_height_m: highest that they may have; points above 0.4 of it are counted in 20 levels.
+      stray_share: of the points; those of a level count as spread evenly over it.
+
+    Returns:
+      m; at most the highest, and that where no point is in a level.
+    """
+    if len(height) == 0:
+        return 0.0
+    edges = np.linspace(LOWEST_LEVEL * max_height_m, max_height_m, NUM_LEVELS + 1)
+    left = stray_share * len(height)
+    for count, low, high in reversed(
+        list(zip(np.histogram(height, edges)[0], edges, edges[1:], strict=False))
+    ):
+        if count > left:
+            return float(min(high - (high - low) * left / count, height.max()))
+        left -= count
+    return float(height.max())
 
 
 def depth_behind_faces(xy: np.ndarray, box: np.ndarray) -> np.ndarray:

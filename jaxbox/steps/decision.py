@@ -66,6 +66,7 @@ def score_boxes(
         margin_m=settings.margin_m,
         ring_m=settings.ring_m,
         upper_height_m=settings.upper_height_m,
+        stray_share=settings.stray_share,
     )
     rho = jnp.linalg.norm(rectangle[:, :2], axis=1)
     late = vehicles.surroundings_score(
