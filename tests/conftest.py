@@ -1,7 +1,9 @@
 """Shared fixtures: the real sweeps, and compiled functions that the tests share."""
 
+import importlib
 import os
 import pathlib
+from typing import Any
 
 import hypothesis
 import jax
@@ -27,6 +29,12 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_compilation_cache_dir", folder)
     # Two, so that work over several devices can be tested; the first is the default as ever.
     jax.config.update("jax_num_cpu_devices", 2)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """With `-n`, of one file all tests run in one process: they share compiled functions."""
+    return importlib.import_module("xdist.scheduler").LoadFileScheduling(config, log)
 
 
 @pytest.fixture(scope="session")
