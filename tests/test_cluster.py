@@ -367,6 +367,7 @@ def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_p
     assert [path for path in server.asked if path.endswith(".bin") and "drive_1" not in path] == []
     manifest = manifest_of(tmp_path)
     assert (manifest["finished"], manifest["num_done"], manifest["num_skipped"]) == (True, 6, 2)
+    assert manifest["num_done_before"] == 4
     assert sum(len(part["status"]) for part in manifest["partitions"]) == 6
     assert manifest["versions"]["jax"] == jax.__version__
     config = io.read_config(tmp_path / "config.toml")
@@ -405,6 +406,19 @@ def test_without_ray_the_extra_is_named(tmp_path, monkeypatch):
     result = run("detect", tmp_path, "--output", tmp_path / "out", "--engine", "ray")
     assert result.exit_code == 2
     assert "pip install 'jaxbox[ray]'" in result.stderr
+
+
+def test_the_rate_counts_the_sweeps_of_this_run_alone(tmp_path, monkeypatch):
+    parts = [
+        PartitionReport(name=f"part-{number:06d}", key="", num_sweeps=3, status=dict.fromkeys("abc", 0))
+        for number in range(3)
+    ]
+    report = DatasetReport(partitions=parts, num_skipped=2, num_done_before=6, workers=1, elapsed_s=6.0)
+    monkeypatch.setattr(detect_ray, "detect_dataset", lambda *_, **__: report)
+    result = run("detect", tmp_path, "--output", tmp_path / "out", "--engine", "ray", "--resume")
+    assert result.exit_code == 0, result.output
+    assert "3 sweeps done, 0 failed, 6 done before" in result.stdout
+    assert "6.0 s in all with starting and compiling, 0.5 sweeps a second" in result.stdout
 
 
 def test_where_ray_gives_up_the_command_says_so(tmp_path, monkeypatch):

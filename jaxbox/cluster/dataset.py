@@ -185,7 +185,10 @@ class _Run:
         kept = self._look(partitions, resume)
         missing = [partition for partition in partitions if partition.name not in kept]
         reports = dict(kept)
-        report = DatasetReport(partitions=[], num_skipped=len(kept), workers=workers)
+        num_done_before = sum(part.num_done for part in kept.values())
+        report = DatasetReport(
+            partitions=[], num_skipped=len(kept), num_done_before=num_done_before, workers=workers
+        )
         self._store.make()
         self._forget_attempts()
         self._store.write_text(CONFIG, settings_to_toml(self.task.config))
