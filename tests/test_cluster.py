@@ -189,6 +189,21 @@ def test_a_file_of_a_store_is_whole_or_absent(tmp_path, url):
     assert store.names() == []
 
 
+def test_what_a_killed_writer_sent_in_part_is_removed(tmp_path, monkeypatch):
+    store = Store(tmp_path)
+    with monkeypatch.context() as patch:
+        # As where it is killed between sending and renaming.
+        patch.setattr(store._system, "mv", _fail)
+        patch.setattr(store._system, "rm_file", _fail)
+        with pytest.raises(OSError, match="disk"):
+            store.write_text("part-000000.parquet", "whole")
+    assert [name.startswith(".part-000000.parquet.") for name in store.names()] == [True]
+    (tmp_path / ".hidden").touch()
+    (tmp_path / "drive.part").touch()
+    store.remove_partials()
+    assert store.names() == [".hidden", "drive.part"]
+
+
 def test_a_store_that_cannot_be_renamed_in_leaves_nothing(tmp_path, monkeypatch):
     store = Store(tmp_path / "out")
     store.make()
@@ -328,6 +343,8 @@ def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_p
     target = f"/archive/drive_2/{KILLED_AT}.bin"
     for path in tmp_path.glob("part-000002*"):
         path.unlink()
+    # What a worker leaves that is killed while it sends its file.
+    (tmp_path / ".part-000002.parquet.0a1b.part").write_bytes(b"half")
     killed = []
 
     def kill_once(path):

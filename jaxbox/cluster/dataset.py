@@ -190,6 +190,7 @@ class _Run:
             partitions=[], num_skipped=len(kept), num_done_before=num_done_before, workers=workers
         )
         self._store.make()
+        self._store.remove_partials()
         self._forget_attempts()
         self._store.write_text(CONFIG, settings_to_toml(self.task.config))
         self._account(report, finished=False)
