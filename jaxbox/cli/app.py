@@ -1,6 +1,7 @@
 """The seven commands and their options; the work is done in the module of each."""
 
 import enum
+import math
 import pathlib
 from typing import Annotated
 
@@ -58,6 +59,25 @@ DrivesOption = Annotated[
     pathlib.Path | None, typer.Option(help='Text file of the drive of each frame: "frame drive" a line.')
 ]
 TopicOption = Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")]
+
+
+def _finite_position(position: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+    if position is not None and not all(map(math.isfinite, position)):
+        raise typer.BadParameter(f"{' '.join(map(str, position))}: give three finite numbers, in metres.")
+    return position
+
+
+SensorAtOption = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option(
+        metavar="X Y Z",
+        callback=_finite_position,
+        help="Where the sensor is in the points' frame (m), if not at 0 0 0.",
+    ),
+]
+LevelOption = Annotated[
+    bool, typer.Option("--level", help="Measure how the sensor is tilted, and see the sweeps upright.")
+]
 CapacityOption = Annotated[
     int | None,
     typer.Option(min=1, help="Points a sweep is padded to; by default what it needs. One compile each."),
@@ -170,13 +190,8 @@ def detect(
         ),
     ] = None,
     topic: TopicOption = None,
-    sensor_at: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option(metavar="X Y Z", help="Where the sensor is in the points' frame (m), if not at 0 0 0."),
-    ] = None,
-    level: Annotated[
-        bool, typer.Option("--level", help="Measure how the sensor is tilted, and see the sweeps upright.")
-    ] = False,
+    sensor_at: SensorAtOption = None,
+    level: LevelOption = False,
     capacity: CapacityOption = None,
     min_score: Annotated[
         float,
