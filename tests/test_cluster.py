@@ -408,6 +408,8 @@ def test_what_the_workers_cannot_do_is_refused(tmp_path):
     for arguments, expected in (
         (("--engine", "ray", "--format", "kitti"), "write parquet"),
         (("--engine", "ray", "--pictures"), "draw none"),
+        (("--engine", "ray", "--no-points"), "holds no points"),
+        (("--sweeps-per-partition", "9"), "only --engine ray writes partitions"),
         (("--address", "auto"), "only --engine ray"),
         (("--output", "s3://bucket/out"), "only --engine ray"),
     ):

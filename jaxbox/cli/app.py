@@ -20,6 +20,7 @@ from jaxbox.cli.settings import chosen_config, complete_preset, complete_setting
 from jaxbox.cli.sweep_info import print_sweep_info
 from jaxbox.cli.tune import TuneOptions, run_tune
 from jaxbox.cli.view import ViewOptions, run_view
+from jaxbox.cluster.dataset import SWEEPS_PER_PARTITION
 from jaxbox.evaluation.copies import COPIES
 from jaxbox.evaluation.objectives import OBJECTIVES
 from jaxbox.io import InputError
@@ -202,7 +203,12 @@ def detect(
             f"pictures and counts never show less than {SHOWN_MIN_SCORE:g}.",
         ),
     ] = 0.0,
-    points: Annotated[bool, typer.Option(help="Put the points into MCAP and rerun files too.")] = True,
+    points: Annotated[
+        bool | None,
+        typer.Option(
+            "--points/--no-points", help="Put the points into MCAP and rerun files too. By default yes."
+        ),
+    ] = None,
     pictures: Annotated[
         bool | None,
         typer.Option(
@@ -224,8 +230,11 @@ def detect(
         str | None, typer.Option(help="Of the Ray cluster, such as auto; by default one is started here.")
     ] = None,
     sweeps_per_partition: Annotated[
-        int, typer.Option(min=1, help="Sweeps of each Parquet file, with ray.")
-    ] = 256,
+        int | None,
+        typer.Option(
+            min=1, help=f"Sweeps of each Parquet file, with ray; {SWEEPS_PER_PARTITION} by default."
+        ),
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Pass over sweeps whose results in OUTPUT are complete.")
     ] = False,
@@ -254,9 +263,10 @@ def detect(
                 config=config,
                 formats=frozenset(result_format or []),
                 pictures=bool(pictures),
+                points=points,
                 address=address,
                 jobs=jobs,
-                sweeps_per_partition=sweeps_per_partition,
+                sweeps_per_partition=sweeps_per_partition or SWEEPS_PER_PARTITION,
                 topic=topic,
                 capacity=capacity,
                 min_score=min_score,
@@ -267,6 +277,10 @@ def detect(
             raise typer.Exit(run_detect_ray(paths, ray_options))
         if address is not None:
             raise InputError("--address: only --engine ray has one; add it, or leave the address out.")
+        if sweeps_per_partition is not None:
+            raise InputError(
+                "--sweeps-per-partition: only --engine ray writes partitions; add it, or leave this out."
+            )
         if "://" in output:
             raise InputError(
                 f"--output {output}: only --engine ray writes to a URL; add it, or give a folder."
@@ -280,7 +294,7 @@ def detect(
             level=level,
             capacity=capacity,
             min_score=min_score,
-            points=points,
+            points=True if points is None else points,
             pictures=True if pictures is None else pictures,
             jobs=jobs or 1,
             resume=resume,

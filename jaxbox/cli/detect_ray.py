@@ -25,6 +25,8 @@ class RayOptions:
     """What was asked for; only Parquet can be written."""
     pictures: bool
     """Whether pictures were asked for; none can be drawn."""
+    points: bool | None
+    """Whether the points were asked for; None where nothing was said, as Parquet holds none."""
     address: str | None
     """Of the cluster; None to start one here."""
     jobs: int | None
@@ -56,6 +58,10 @@ class RayOptions:
             )
         if self.pictures:
             raise InputError("--pictures: the workers of --engine ray draw none; leave the option out.")
+        if self.points is not None:
+            raise InputError(
+                "--points and --no-points: the parquet of --engine ray holds no points; leave the option out."
+            )
 
 
 def run_detect_ray(paths: Sequence[str], options: RayOptions) -> ExitCode:
