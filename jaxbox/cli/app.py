@@ -16,7 +16,7 @@ from jaxbox.cli.evaluate import run_eval
 from jaxbox.cli.export import Platform, run_export
 from jaxbox.cli.info import print_info
 from jaxbox.cli.report import SHOWN_MIN_SCORE
-from jaxbox.cli.settings import chosen_config, complete_preset, complete_setting
+from jaxbox.cli.settings import chosen_config, chosen_preset, complete_preset, complete_setting
 from jaxbox.cli.sweep_info import print_sweep_info
 from jaxbox.cli.tune import TuneOptions, run_tune
 from jaxbox.cli.view import ViewOptions, run_view
@@ -380,10 +380,11 @@ def tune(
     with input_errors():
         if objective not in OBJECTIVES:
             raise InputError(f"--objective {objective}: choose one of {', '.join(OBJECTIVES)}.")
+        config = chosen_config(preset, settings, changes or [], sensor=sensor)
         options = TuneOptions(
             output=output,
-            preset=preset or "default",
-            config=chosen_config(preset or "default", settings, changes or [], sensor=sensor),
+            preset=chosen_preset(preset, settings),
+            config=config,
             search=search or [],
             trials=trials,
             refine=refine,
