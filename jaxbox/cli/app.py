@@ -458,6 +458,8 @@ def view(
     settings: SettingsOption = None,
     changes: SetOption = None,
     topic: TopicOption = None,
+    sensor_at: SensorAtOption = None,
+    level: LevelOption = False,
     capacity: CapacityOption = None,
     min_score: Annotated[
         float,
@@ -475,6 +477,8 @@ def view(
             host=host,
             port=port,
             topic=topic,
+            sensor_at=sensor_at,
+            level=level,
             capacity=capacity,
             min_score=min_score,
             open_browser=open_browser,
