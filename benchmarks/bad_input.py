@@ -215,6 +215,7 @@ OK = Status.OK
 LOST = Status.NO_GROUND
 EMPTY = Status.EMPTY | Status.NO_GROUND
 NONFINITE = Status.NONFINITE_POINTS
+ABOVE = Status.GROUND_ABOVE
 
 
 def _both(status: Status) -> dict[str, Status]:
@@ -290,7 +291,7 @@ WORLDS = (
         _each(OK, LOST),
         best_score=DEFAULT_CUT,
     ),
-    Case("sensor upside down", _turned_over, _both(OK), best_score=DEFAULT_CUT),
+    Case("sensor upside down", _turned_over, _both(ABOVE), best_score=DEFAULT_CUT),
     Case(
         "sensor on its side", lambda: (street()[:, [0, 2, 1]], None), _each(OK, LOST), best_score=DEFAULT_CUT
     ),

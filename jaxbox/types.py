@@ -40,6 +40,7 @@ class Status(enum.IntFlag):
     CANDIDATE_OVERFLOW = 128
     DETECTION_OVERFLOW = 256
     HULL_OVERFLOW = 512
+    GROUND_ABOVE = 1024
 
     def describe(self) -> list[str]:
         """Returns one sentence a set bit: what happened and what to do about it.
@@ -69,6 +70,9 @@ _STATUS_TEXT = {
     "the lowest-scoring were dropped.",
     Status.HULL_OVERFLOW: "a hull has more vertices than hull.max_vertices; "
     "every so many were kept, evenly round the hull.",
+    Status.GROUND_ABOVE: "the ground lies above the origin, so that vehicles hang from it and are not found. "
+    "The sensor is mounted upside down, z points down, or the points are not in the sensor's frame; turn or "
+    "move them first.",
 }
 
 

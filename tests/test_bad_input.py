@@ -12,6 +12,7 @@ import pytest
 
 from benchmarks import bad_input, bench_bad_input, common
 from jaxbox import DetectorConfig, PointCloud, Status, detect
+from jaxbox.steps.answer import GROUND_ABOVE_M
 
 CASES = {case.name: case for case in bad_input.CASES}
 HERE = [case.name for case in bad_input.CASES if not case.compiles_anew]
@@ -37,6 +38,17 @@ def test_bad_input_has_a_lawful_answer_with_the_right_status(name, preset):
         same, _ = jax.tree.flatten(answer(case.same_as, preset)[1])
         for leaf, expected in zip(jax.tree.leaves(detections), same, strict=True):
             np.testing.assert_array_equal(leaf, expected)
+
+
+@pytest.mark.parametrize("preset", bad_input.PRESETS)
+def test_the_ground_may_be_as_high_as_the_origin_but_not_above_it(preset):
+    for above_m, expected in ((0.0, False), (GROUND_ABOVE_M - 0.1, False), (GROUND_ABOVE_M + 0.1, True)):
+        # The street's sensor is 1.73 m above it.
+        moved = bad_input.street() + np.array([0, 0, 1.73 + above_m], np.float32)
+        cloud = PointCloud.from_numpy(moved, capacity=bad_input.CAPACITY)
+        found = detect(cloud, DetectorConfig.presets()[preset])
+        assert (Status.GROUND_ABOVE in Status(int(found.status))) == expected
+        assert float(found.ground.coefficients[2]) == pytest.approx(above_m, abs=0.05)
 
 
 @pytest.mark.parametrize("name", [case.name for case in bad_input.STORAGE])

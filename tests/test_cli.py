@@ -311,6 +311,11 @@ def test_an_empty_sweep_is_no_failure_and_its_status_is_in_words(tmp_path):
         (("detect", "{tmp}", "--output", "{tmp}/out", "--min-score", "2"), "min-score"),
         (("detect", "{tmp}", "--output", "{tmp}/out", "--capacity", "0"), "capacity"),
         (("detect", "{tmp}"), "output"),
+        (("detect", "{tmp}", "--output", "{tmp}/out", "--sensor-at", "0", "nan", "1"), "0.0 nan 1.0: give"),
+        (
+            ("detect", "{tmp}", "--output", "{tmp}/out", "--sensor-at", "inf", "0", "1"),
+            "three finite numbers",
+        ),
         (("detect", "{tmp}", "--output", "{tmp}/out", "--set", "box.angles=9"), "nearest are box."),
         (("detect", "{tmp}", "--output", "{tmp}/out", "--settings", "{tmp}/no.json"), "no.json"),
         (

@@ -11,7 +11,7 @@ import jaxbox
 from jaxbox import synthetic
 from jaxbox.cli import app, cache
 from jaxbox.detector import count_compilations
-from jaxbox.io import objects_from_detections, write_bin, write_calibration, write_labels
+from jaxbox.io import objects_from_detections, read_config, write_bin, write_calibration, write_labels
 from jaxbox.tuning import Bench
 from jaxbox.types import PointCloud
 
@@ -76,8 +76,20 @@ def test_a_wrong_base_is_told_from_a_better_setting_on_drives_left_out(kitti_fol
     assert f"Take trial {report['best']['trial']}" in result.stdout
     assert f"Take trial {report['best']['trial']}" in (output / "report.md").read_text()
     best = json.loads((output / "best.json").read_text())
-    assert best == report["best"]["changes"]
+    assert best == {"preset": "default"} | report["best"]["changes"]
     assert 3.6 <= best["vehicles.classes.0.length_m"] <= 4.4
+
+
+def test_the_preset_of_a_settings_file_is_the_base_and_the_best_settings_name_it(kitti_folder, tmp_path):
+    settings = tmp_path / "mine.toml"
+    settings.write_text('preset = "paper"\nvehicles.max_overlap = 0.2\n')
+    output = tmp_path / "tune"
+    result = tune(kitti_folder, output, "--config", settings, "--trials", 1)
+    assert result.exit_code == 0, result.output
+    assert read_report(output)["preset"] == "paper"
+    assert "Settings tried on the paper preset" in (output / "report.md").read_text()
+    assert json.loads((output / "best.json").read_text()) == {"preset": "paper", "vehicles.max_overlap": 0.2}
+    assert read_config(output / "best.json") == read_config(settings)
 
 
 def test_no_trial_compiles_the_detector_again(kitti_folder, tmp_path):

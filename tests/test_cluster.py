@@ -189,6 +189,21 @@ def test_a_file_of_a_store_is_whole_or_absent(tmp_path, url):
     assert store.names() == []
 
 
+def test_what_a_killed_writer_sent_in_part_is_removed(tmp_path, monkeypatch):
+    store = Store(tmp_path)
+    with monkeypatch.context() as patch:
+        # As where it is killed between sending and renaming.
+        patch.setattr(store._system, "mv", _fail)
+        patch.setattr(store._system, "rm_file", _fail)
+        with pytest.raises(OSError, match="disk"):
+            store.write_text("part-000000.parquet", "whole")
+    assert [name.startswith(".part-000000.parquet.") for name in store.names()] == [True]
+    (tmp_path / ".hidden").touch()
+    (tmp_path / "drive.part").touch()
+    store.remove_partials()
+    assert store.names() == [".hidden", "drive.part"]
+
+
 def test_a_store_that_cannot_be_renamed_in_leaves_nothing(tmp_path, monkeypatch):
     store = Store(tmp_path / "out")
     store.make()
@@ -328,6 +343,8 @@ def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_p
     target = f"/archive/drive_2/{KILLED_AT}.bin"
     for path in tmp_path.glob("part-000002*"):
         path.unlink()
+    # What a worker leaves that is killed while it sends its file.
+    (tmp_path / ".part-000002.parquet.0a1b.part").write_bytes(b"half")
     killed = []
 
     def kill_once(path):
@@ -367,6 +384,7 @@ def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_p
     assert [path for path in server.asked if path.endswith(".bin") and "drive_1" not in path] == []
     manifest = manifest_of(tmp_path)
     assert (manifest["finished"], manifest["num_done"], manifest["num_skipped"]) == (True, 6, 2)
+    assert manifest["num_done_before"] == 4
     assert sum(len(part["status"]) for part in manifest["partitions"]) == 6
     assert manifest["versions"]["jax"] == jax.__version__
     config = io.read_config(tmp_path / "config.toml")
@@ -390,6 +408,8 @@ def test_what_the_workers_cannot_do_is_refused(tmp_path):
     for arguments, expected in (
         (("--engine", "ray", "--format", "kitti"), "write parquet"),
         (("--engine", "ray", "--pictures"), "draw none"),
+        (("--engine", "ray", "--no-points"), "holds no points"),
+        (("--sweeps-per-partition", "9"), "only --engine ray writes partitions"),
         (("--address", "auto"), "only --engine ray"),
         (("--output", "s3://bucket/out"), "only --engine ray"),
     ):
@@ -405,6 +425,19 @@ def test_without_ray_the_extra_is_named(tmp_path, monkeypatch):
     result = run("detect", tmp_path, "--output", tmp_path / "out", "--engine", "ray")
     assert result.exit_code == 2
     assert "pip install 'jaxbox[ray]'" in result.stderr
+
+
+def test_the_rate_counts_the_sweeps_of_this_run_alone(tmp_path, monkeypatch):
+    parts = [
+        PartitionReport(name=f"part-{number:06d}", key="", num_sweeps=3, status=dict.fromkeys("abc", 0))
+        for number in range(3)
+    ]
+    report = DatasetReport(partitions=parts, num_skipped=2, num_done_before=6, workers=1, elapsed_s=6.0)
+    monkeypatch.setattr(detect_ray, "detect_dataset", lambda *_, **__: report)
+    result = run("detect", tmp_path, "--output", tmp_path / "out", "--engine", "ray", "--resume")
+    assert result.exit_code == 0, result.output
+    assert "3 sweeps done, 0 failed, 6 done before" in result.stdout
+    assert "6.0 s in all with starting and compiling, 0.5 sweeps a second" in result.stdout
 
 
 def test_where_ray_gives_up_the_command_says_so(tmp_path, monkeypatch):

@@ -260,9 +260,12 @@ def test_the_size_of_a_picture_is_read_from_its_head(tmp_path, suffix, monkeypat
     picture = np.zeros((6, 8, 3), np.uint8)
     images.cv2.imwrite(str(tmp_path / f"a{suffix}"), picture)
     assert io.read_image(tmp_path / f"a{suffix}").shape == (6, 8, 3)
+    monkeypatch.setattr(images.cv2, "imdecode", None)
+    assert images.read_image_size(tmp_path / f"a{suffix}") == (8, 6)
     monkeypatch.setattr(images, "MAX_PIXELS", 47)
-    with pytest.raises(io.InputError, match="it claims 8 x 6 pixels; at most 47"):
-        io.read_image(tmp_path / f"a{suffix}")
+    for read in (io.read_image, images.read_image_size):
+        with pytest.raises(io.InputError, match="it claims 8 x 6 pixels; at most 47"):
+            read(tmp_path / f"a{suffix}")
 
 
 def test_pickled_arrays_are_refused_and_never_run(tmp_path):

@@ -137,6 +137,21 @@ def test_object_layout_is_found_from_any_folder_and_file(data_root, below):
     assert len(xyz) > 100_000
 
 
+def test_an_image_is_not_decoded_for_its_size_and_lies_as_it_is_stored(tmp_path, monkeypatch):
+    for folder, name, text in (("velodyne", "1.bin", ""), ("calib", "1.txt", CALIB)):
+        (tmp_path / folder).mkdir()
+        write(tmp_path / folder / name, text)
+    (tmp_path / "image_2").mkdir()
+    jpeg = cv2.imencode(".jpg", np.zeros((6, 8, 3), np.uint8))[1].tobytes()
+    # Exif that says "turn me by a quarter", as a phone writes it.
+    turned = bytes.fromhex("ffe1 0022 457869660000 49492a0008000000 0100 12010300 01000000 06000000 00000000")
+    (tmp_path / "image_2" / "1.jpg").write_bytes(jpeg[:2] + turned + jpeg[2:])
+    (sweep,) = io.open_sweeps(tmp_path)
+    assert sweep.read_image().shape == (6, 8, 3)
+    monkeypatch.setattr(cv2, "imdecode", None)
+    np.testing.assert_array_equal(sweep.read_calibration().image_size_px, [8, 6])
+
+
 def test_object_sweep_without_image_has_the_usual_size(data_root):
     (sweep,) = io.open_sweeps(data_root / "kitti_object/training/velodyne/000157.bin")
     assert sweep.read_image() is None

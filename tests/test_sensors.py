@@ -160,6 +160,34 @@ def test_detect_sees_a_tilted_sweep_from_the_ground_upright(tmp_path):
     # Of boxes worth acting on, at most one is another's: the points differ by a hair.
     distance = np.linalg.norm(boxes["tilted"][:, None] - boxes["upright"], axis=-1).min(axis=0)
     assert np.sum(distance < 0.3) >= len(boxes["upright"]) - 1
-    T = np.array(json.loads((tmp_path / "tilted" / "run.json").read_text())["options"]["T_level_points"])
+    T = np.array(json.loads((tmp_path / "tilted" / "run.json").read_text())["mounting"]["T_level_points"])
     np.testing.assert_allclose(T[:3, :3] @ pitch, np.eye(3), atol=0.01)
     np.testing.assert_allclose(T @ [*sensor_at, 1], [0, 0, 0, 1], atol=1e-5)
+
+
+def test_resuming_where_the_archive_grew_goes_on_in_the_level_frame_of_the_earlier_run(tmp_path):
+    xyz = synthetic.make_sweep(0, num_beams=32, num_azimuths=520).xyz
+    output, sweeps = tmp_path / "out", tmp_path / "sweeps"
+
+    def detect(*more):
+        words = ["--preset", "fast", "--capacity", "16384", "--format", "jsonl", "--no-pictures", "--resume"]
+        return CliRunner().invoke(app, ["detect", str(sweeps), "--output", str(output), *words, *more])
+
+    sweeps.mkdir()
+    for number, tilt in enumerate((0.2, 0.1)):
+        pitch = np.array([[np.cos(tilt), 0, np.sin(tilt)], [0, 1, 0], [-np.sin(tilt), 0, np.cos(tilt)]])
+        np.save(sweeps / f"{number}.npy", xyz @ pitch.T)
+        result = detect("--level")
+        assert result.exit_code == 0, result.output
+        assert "tilted 11.5 degrees" in result.stdout
+    assert [record["name"] for record in io.read_jsonl(output / "detections.jsonl")] == ["0", "1"]
+    for options, expected in (
+        ((), "level differ"),
+        (("--level", "--sensor-at", "0", "0", "1"), "sensor_at differ"),
+    ):
+        result = detect(*options)
+        assert result.exit_code == 2
+        assert expected in result.stderr
+    account = json.loads((output / "run.json").read_text())
+    (output / "run.json").write_text(json.dumps(account | {"mounting": {"up": [0, 1]}}))
+    assert "does not say how the sensor stood" in detect("--level").stderr

@@ -619,3 +619,21 @@ def test_the_command_tells_the_address_and_ends_on_interrupt(host, folder, monke
     assert re.search(r"3 sweeps at http://[\w.]+:\d+ ", result.stdout)
     assert ("everybody" in result.stderr) == (host == "0.0.0.0")
     assert (asked[0].preset, asked[0].view.min_score) == ("paper", 0.4)
+
+
+@pytest.mark.usefixtures("_no_user_cache")
+def test_the_command_shows_a_tilted_sweep_upright(tmp_path, monkeypatch):
+    sin, cos = np.sin(0.2), np.cos(0.2)
+    np.save(tmp_path / "a.npy", street(0).xyz @ np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]).T)
+    seen = []
+
+    def interrupted(viewer):
+        seen.append(viewer._session.frame(0).xyz)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Viewer, "run", interrupted)
+    result = run("view", tmp_path, "--port", 0, "--level", "--sensor-at", 0, 0, 0.5)
+    assert result.exit_code == 0, result.output
+    assert "tilted 11." in result.stdout
+    # Half a degree at the farthest point.
+    np.testing.assert_allclose(seen[0], street(0).xyz - [-0.5 * sin, 0, 0.5 * cos], atol=0.7)

@@ -1,6 +1,7 @@
 """The seven commands and their options; the work is done in the module of each."""
 
 import enum
+import math
 import pathlib
 from typing import Annotated
 
@@ -15,10 +16,11 @@ from jaxbox.cli.evaluate import run_eval
 from jaxbox.cli.export import Platform, run_export
 from jaxbox.cli.info import print_info
 from jaxbox.cli.report import SHOWN_MIN_SCORE
-from jaxbox.cli.settings import chosen_config, complete_preset, complete_setting
+from jaxbox.cli.settings import chosen_config, chosen_preset, complete_preset, complete_setting
 from jaxbox.cli.sweep_info import print_sweep_info
 from jaxbox.cli.tune import TuneOptions, run_tune
 from jaxbox.cli.view import ViewOptions, run_view
+from jaxbox.cluster.dataset import SWEEPS_PER_PARTITION
 from jaxbox.evaluation.copies import COPIES
 from jaxbox.evaluation.objectives import OBJECTIVES
 from jaxbox.io import InputError
@@ -58,6 +60,25 @@ DrivesOption = Annotated[
     pathlib.Path | None, typer.Option(help='Text file of the drive of each frame: "frame drive" a line.')
 ]
 TopicOption = Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")]
+
+
+def _finite_position(position: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+    if position is not None and not all(map(math.isfinite, position)):
+        raise typer.BadParameter(f"{' '.join(map(str, position))}: give three finite numbers, in metres.")
+    return position
+
+
+SensorAtOption = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option(
+        metavar="X Y Z",
+        callback=_finite_position,
+        help="Where the sensor is in the points' frame (m), if not at 0 0 0.",
+    ),
+]
+LevelOption = Annotated[
+    bool, typer.Option("--level", help="Measure how the sensor is tilted, and see the sweeps upright.")
+]
 CapacityOption = Annotated[
     int | None,
     typer.Option(min=1, help="Points a sweep is padded to; by default what it needs. One compile each."),
@@ -170,13 +191,8 @@ def detect(
         ),
     ] = None,
     topic: TopicOption = None,
-    sensor_at: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option(metavar="X Y Z", help="Where the sensor is in the points' frame (m), if not at 0 0 0."),
-    ] = None,
-    level: Annotated[
-        bool, typer.Option("--level", help="Measure how the sensor is tilted, and see the sweeps upright.")
-    ] = False,
+    sensor_at: SensorAtOption = None,
+    level: LevelOption = False,
     capacity: CapacityOption = None,
     min_score: Annotated[
         float,
@@ -187,7 +203,12 @@ def detect(
             f"pictures and counts never show less than {SHOWN_MIN_SCORE:g}.",
         ),
     ] = 0.0,
-    points: Annotated[bool, typer.Option(help="Put the points into MCAP and rerun files too.")] = True,
+    points: Annotated[
+        bool | None,
+        typer.Option(
+            "--points/--no-points", help="Put the points into MCAP and rerun files too. By default yes."
+        ),
+    ] = None,
     pictures: Annotated[
         bool | None,
         typer.Option(
@@ -209,8 +230,11 @@ def detect(
         str | None, typer.Option(help="Of the Ray cluster, such as auto; by default one is started here.")
     ] = None,
     sweeps_per_partition: Annotated[
-        int, typer.Option(min=1, help="Sweeps of each Parquet file, with ray.")
-    ] = 256,
+        int | None,
+        typer.Option(
+            min=1, help=f"Sweeps of each Parquet file, with ray; {SWEEPS_PER_PARTITION} by default."
+        ),
+    ] = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Pass over sweeps whose results in OUTPUT are complete.")
     ] = False,
@@ -239,9 +263,10 @@ def detect(
                 config=config,
                 formats=frozenset(result_format or []),
                 pictures=bool(pictures),
+                points=points,
                 address=address,
                 jobs=jobs,
-                sweeps_per_partition=sweeps_per_partition,
+                sweeps_per_partition=sweeps_per_partition or SWEEPS_PER_PARTITION,
                 topic=topic,
                 capacity=capacity,
                 min_score=min_score,
@@ -252,6 +277,10 @@ def detect(
             raise typer.Exit(run_detect_ray(paths, ray_options))
         if address is not None:
             raise InputError("--address: only --engine ray has one; add it, or leave the address out.")
+        if sweeps_per_partition is not None:
+            raise InputError(
+                "--sweeps-per-partition: only --engine ray writes partitions; add it, or leave this out."
+            )
         if "://" in output:
             raise InputError(
                 f"--output {output}: only --engine ray writes to a URL; add it, or give a folder."
@@ -265,7 +294,7 @@ def detect(
             level=level,
             capacity=capacity,
             min_score=min_score,
-            points=points,
+            points=True if points is None else points,
             pictures=True if pictures is None else pictures,
             jobs=jobs or 1,
             resume=resume,
@@ -351,10 +380,11 @@ def tune(
     with input_errors():
         if objective not in OBJECTIVES:
             raise InputError(f"--objective {objective}: choose one of {', '.join(OBJECTIVES)}.")
+        config = chosen_config(preset, settings, changes or [], sensor=sensor)
         options = TuneOptions(
             output=output,
-            preset=preset or "default",
-            config=chosen_config(preset or "default", settings, changes or [], sensor=sensor),
+            preset=chosen_preset(preset, settings),
+            config=config,
             search=search or [],
             trials=trials,
             refine=refine,
@@ -428,6 +458,8 @@ def view(
     settings: SettingsOption = None,
     changes: SetOption = None,
     topic: TopicOption = None,
+    sensor_at: SensorAtOption = None,
+    level: LevelOption = False,
     capacity: CapacityOption = None,
     min_score: Annotated[
         float,
@@ -445,6 +477,8 @@ def view(
             host=host,
             port=port,
             topic=topic,
+            sensor_at=sensor_at,
+            level=level,
             capacity=capacity,
             min_score=min_score,
             open_browser=open_browser,

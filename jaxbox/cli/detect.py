@@ -11,6 +11,7 @@ from rich.progress import Progress
 from jaxbox import io
 from jaxbox.cli.console import ExitCode, make_progress, print_error, stderr, stdout, stoppable, undisturbed
 from jaxbox.cli.frames import Frame, FrameSource, FrameWork
+from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
 from jaxbox.cli.report import (
     SHOWN_MIN_SCORE,
     FrameOutcome,
@@ -22,7 +23,6 @@ from jaxbox.cli.report import (
 from jaxbox.cli.results import RUN_NAME, ResultFormat, Results, RunAccount, written
 from jaxbox.config import DetectorConfig
 from jaxbox.io.jsonl import JSONL
-from jaxbox.mounting import Mounting
 from jaxbox.workers import WorkerDied
 
 PICTURE_FOLDER = "pictures"
@@ -87,24 +87,11 @@ def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
     Raises:
       InputError: where a path holds no sweeps, or the options cannot be used.
     """
-    sweeps, mounting = _mounted(io.open_sweeps(paths, topic=options.topic), options)
+    sweeps, account = _prepare(paths, options)
     with written(options.output):
         options.output.mkdir(parents=True, exist_ok=True)
     for folder in (options.output, options.output / PICTURE_FOLDER):
         io.remove_abandoned(folder)
-    account = RunAccount(
-        output=options.output,
-        config=options.config,
-        options={
-            "min_score": options.min_score,
-            "capacity": options.capacity,
-            "topic": options.topic,
-            "T_level_points": None if mounting is None else mounting.T_level_points.round(6).tolist(),
-        },
-        inputs=tuple(paths),
-    )
-    if options.resume:
-        account.check_resumable()
     run = RunReport(jobs=options.jobs)
     start = time.perf_counter()
     with Results(
@@ -129,28 +116,32 @@ def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
     return ExitCode.FRAME_FAILED if run.failures or run.interrupted else ExitCode.OK
 
 
-def _mounted(
-    sweeps: Sequence[io.Sweep], options: DetectOptions
-) -> tuple[Sequence[io.Sweep], Mounting | None]:
-    """The sweeps as seen from the sensor, upright where wanted; and how it stands, if not as usual."""
-    position = options.sensor_at or (0.0, 0.0, 0.0)
-    if options.level:
-        mounting = io.measure_sweeps(sweeps, position=position)
-        if options.speaks:
-            stdout().print(describe_mounting(mounting), markup=False)
-    elif any(position):
-        mounting = Mounting(position)
-    else:
-        return sweeps, None
-    return io.LevelSweeps(sweeps, mounting), mounting
-
-
-def describe_mounting(mounting: Mounting) -> str:
-    """A measured mounting in words."""
-    return (
-        f"the sensor stands {mounting.height_m:.2f} m above the ground, tilted {mounting.tilt_deg:.1f} "
-        f"degrees; boxes are in the level frame, see T_level_points in {RUN_NAME}"
+def _prepare(paths: Sequence[str], options: DetectOptions) -> tuple[Sequence[io.Sweep], RunAccount]:
+    """The sweeps as they are seen from the sensor, and the account, which the earlier run's was held to."""
+    sweeps = io.open_sweeps(paths, topic=options.topic)
+    account = RunAccount(
+        output=options.output,
+        config=options.config,
+        options={
+            "min_score": options.min_score,
+            "capacity": options.capacity,
+            "topic": options.topic,
+            "sensor_at": None if options.sensor_at is None else list(options.sensor_at),
+            "level": options.level,
+        },
+        inputs=tuple(paths),
     )
+    if options.resume:
+        account.check_resumable()
+    # Measured anew where the archive has grown, the sensor would stand otherwise than for what is there.
+    earlier = account.earlier_mounting() if options.resume and options.level else None
+    sweeps, mounting = seen_from_sensor(
+        sweeps, sensor_at=options.sensor_at, level=options.level, measured=earlier
+    )
+    if options.level and mounting is not None and options.speaks:
+        where = f"see T_level_points in {RUN_NAME}"
+        stdout().print(f"{describe_mounting(mounting)}, {where}", markup=False)
+    return sweeps, dataclasses.replace(account, mounting=mounting)
 
 
 def _as_json(reasons: list[tuple[str, str]]) -> list[dict[str, str]]:

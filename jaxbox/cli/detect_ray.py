@@ -25,6 +25,8 @@ class RayOptions:
     """What was asked for; only Parquet can be written."""
     pictures: bool
     """Whether pictures were asked for; none can be drawn."""
+    points: bool | None
+    """Whether the points were asked for; None where nothing was said, as Parquet holds none."""
     address: str | None
     """Of the cluster; None to start one here."""
     jobs: int | None
@@ -56,6 +58,10 @@ class RayOptions:
             )
         if self.pictures:
             raise InputError("--pictures: the workers of --engine ray draw none; leave the option out.")
+        if self.points is not None:
+            raise InputError(
+                "--points and --no-points: the parquet of --engine ray holds no points; leave the option out."
+            )
 
 
 def run_detect_ray(paths: Sequence[str], options: RayOptions) -> ExitCode:
@@ -139,10 +145,11 @@ def _tell_end(report: DatasetReport, options: RayOptions, speaks: bool) -> None:
         }
         stdout().out(json.dumps({"summary": summary}, allow_nan=False), highlight=False)
     elif speaks:
-        rate = report.num_done / max(report.elapsed_s, 1e-9)
-        skipped = f", {report.num_skipped} partitions done before" if report.num_skipped else ""
+        num_done = report.num_done - report.num_done_before
+        rate = num_done / max(report.elapsed_s, 1e-9)
+        before = f", {report.num_done_before} done before" if report.num_skipped else ""
         stdout().print(
-            f"{report.num_done} sweeps done, {len(report.failures)} failed{skipped}\n"
+            f"{num_done} sweeps done, {len(report.failures)} failed{before}\n"
             f"{report.num_boxes} boxes in {len(report.partitions)} partitions by {report.workers} workers, "
             f"{report.elapsed_s:.1f} s in all with starting and compiling, {rate:.1f} sweeps a second",
             markup=False,

@@ -20,6 +20,7 @@ from jaxbox.io.parquet import PARQUET
 from jaxbox.io.points import Points
 from jaxbox.io.rerun import RERUN
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
+from jaxbox.mounting import Mounting
 from jaxbox.settings import differing_names
 from jaxbox.types import Calibration, Detections
 from jaxbox.versions import versions
@@ -27,7 +28,8 @@ from jaxbox.versions import versions
 CONFIG_NAME = "config.toml"
 """The exact settings, beside the results."""
 RUN_NAME = "run.json"
-"""Versions, options and outcome, beside the results."""
+"""Versions, options, how the sensor stands, and outcome, beside the results."""
+_TRANSFORM_DECIMALS = 6
 
 
 class ResultFormat(enum.StrEnum):
@@ -183,6 +185,8 @@ class RunAccount:
     """Other options that the results depend on, as JSON can hold them."""
     inputs: tuple[str, ...]
     """Paths that were given."""
+    mounting: Mounting | None = None
+    """How the sensor stands; None where the sweeps are taken as they are."""
 
     def check_resumable(self) -> None:
         """Refuses to go on with other settings than those of the results that are there.
@@ -202,12 +206,33 @@ class RunAccount:
                 f"{RUN_NAME}, or another --output."
             )
 
+    def earlier_mounting(self) -> Mounting | None:
+        """How the sensor stood in the run that is resumed; None where there is none.
+
+        Raises:
+          InputError: where its account does not say.
+        """
+        if not (self.output / CONFIG_NAME).is_file():
+            return None
+        path = self.output / RUN_NAME
+        try:
+            recorded = json.loads(path.read_bytes())["mounting"]
+            x, y, z = map(float, recorded["position"])
+            up_x, up_y, up_z = map(float, recorded["up"])
+            return Mounting((x, y, z), (up_x, up_y, up_z), float(recorded["height_m"]))
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
+            raise io.InputError(
+                f"{path}: it does not say how the sensor stood (mounting), which --resume with --level goes "
+                "by; give another --output."
+            ) from error
+
     def write(self, **outcome: Any) -> None:
         """Writes the two files; before the run without an outcome, and after it."""
         account = {
             "versions": versions(),
             "inputs": list(self.inputs),
             "options": dict(self.options),
+            "mounting": None if self.mounting is None else _mounting_record(self.mounting),
             "written": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
             **outcome,
         }
@@ -215,3 +240,9 @@ class RunAccount:
             io.write_config(self.output / CONFIG_NAME, self.config)
             with io.atomic_writer(self.output / RUN_NAME) as handle:
                 handle.write(json.dumps(account, indent=2) + "\n")
+
+
+def _mounting_record(mounting: Mounting) -> dict[str, Any]:
+    """The exact numbers, and the transform for whoever reads the boxes."""
+    T_level_points = mounting.T_level_points.round(_TRANSFORM_DECIMALS).tolist()
+    return dataclasses.asdict(mounting) | {"T_level_points": T_level_points}

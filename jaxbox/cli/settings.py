@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 from jaxbox.config import DetectorConfig
 from jaxbox.io import InputError, read_config
+from jaxbox.io.config import read_preset
 from jaxbox.settings import all_settings, base_of, parse_change, preset_settings, replace_settings
 from jaxbox.steps import check_settings
 
@@ -50,6 +51,24 @@ def chosen_config(
     except ValueError as error:
         raise InputError(str(error)) from error
     return config
+
+
+def chosen_preset(preset: str | None, file: pathlib.Path | None) -> str:
+    """Name of the preset that `chosen_config` starts from.
+
+    Args:
+      preset: as there.
+      file: as there; it has to be one that was read.
+
+    Returns:
+      One of `DetectorConfig.presets`.
+
+    >>> chosen_preset(None, None)
+    'default'
+    """
+    if preset is not None:
+        return preset
+    return "default" if file is None else read_preset(file)
 
 
 def complete_preset(incomplete: str) -> list[str]:

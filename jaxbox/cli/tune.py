@@ -17,7 +17,7 @@ from jaxbox.detector import count_compilations
 from jaxbox.evaluation.copies import COPIES, Frame, read_frame
 from jaxbox.evaluation.objectives import OBJECTIVES
 from jaxbox.io import InputError, atomic_writer, open_sweeps, read_drives
-from jaxbox.settings import changed_settings
+from jaxbox.settings import PRESET_KEY, changed_settings
 from jaxbox.tuning import Axis, Bench, Trial
 
 
@@ -200,10 +200,11 @@ def write_report(report: dict[str, Any], options: TuneOptions, console: Console)
     for line in [*notes, *tuning.report_sentences(report)]:
         console.print(line, markup=False)
     title = f"Settings tried on the {options.preset} preset"
+    best = {PRESET_KEY: options.preset} | report["base_changes"] | report["best"]["changes"]
     texts = {
         "report.json": json.dumps(report, indent=1, allow_nan=False),
         "report.md": tuning.markdown_report(report, title=title, notes=notes),
-        "best.json": json.dumps(report["base_changes"] | report["best"]["changes"], indent=1),
+        "best.json": json.dumps(best, indent=1),
     }
     for name, text in texts.items():
         with atomic_writer(options.output / name) as handle:

@@ -8,6 +8,7 @@ from rich.console import Console
 
 from jaxbox import io
 from jaxbox.cli.console import ExitCode, stderr, stoppable
+from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
 from jaxbox.config import DetectorConfig
 from jaxbox.viewer import View, Wanted, open_viewer
 from jaxbox.viewer.server import LOOPBACK_NAMES
@@ -25,6 +26,10 @@ class ViewOptions:
     """Port; 0 takes a free one."""
     topic: str | None
     """Topic of the points in recordings."""
+    sensor_at: tuple[float, float, float] | None
+    """Where the sensor is in the frame of the points, m; None for the origin."""
+    level: bool
+    """Whether its tilt is measured, and the sweeps are seen upright."""
     capacity: int | None
     """Points a sweep is padded to, or None for what it needs."""
     min_score: float
@@ -45,10 +50,15 @@ def run_view(paths: Sequence[str], options: ViewOptions, console: Console) -> Ex
       `ExitCode.OK`.
 
     Raises:
-      InputError: where a path holds no sweeps, or the address cannot be listened at.
+      InputError: where a path holds no sweeps, or none with a ground to level by, or the address cannot be
+        listened at.
       ImportError: without the extra ``view``.
     """
-    sweeps = io.open_sweeps(paths, topic=options.topic)
+    sweeps, mounting = seen_from_sensor(
+        io.open_sweeps(paths, topic=options.topic), sensor_at=options.sensor_at, level=options.level
+    )
+    if options.level and mounting is not None:
+        console.print(describe_mounting(mounting), markup=False)
     wanted = initial_wish(options.config, min_score=options.min_score)
     with open_viewer(
         sweeps, wanted=wanted, host=options.host, port=options.port, capacity=options.capacity

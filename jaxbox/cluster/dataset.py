@@ -30,6 +30,8 @@ MANIFEST = "manifest.json"
 """The account of a run, beside its partitions."""
 CONFIG = "config.toml"
 """The exact settings, beside its partitions."""
+SWEEPS_PER_PARTITION = 256
+"""Some 10 s of work, which is what a worker that dies costs, in files that are worth opening."""
 _LOOKERS = 16
 """Threads that look at the partitions of an earlier run: each look waits for the file system."""
 _STORE_BYTES = 2**28
@@ -48,7 +50,7 @@ def detect_dataset(
     address: str | None = None,
     workers: int | None = None,
     cpus_per_worker: int = 1,
-    sweeps_per_partition: int = 256,
+    sweeps_per_partition: int = SWEEPS_PER_PARTITION,
     batch: int = 8,
     capacity: int | None = None,
     min_score: float = 0.0,
@@ -185,8 +187,12 @@ class _Run:
         kept = self._look(partitions, resume)
         missing = [partition for partition in partitions if partition.name not in kept]
         reports = dict(kept)
-        report = DatasetReport(partitions=[], num_skipped=len(kept), workers=workers)
+        num_done_before = sum(part.num_done for part in kept.values())
+        report = DatasetReport(
+            partitions=[], num_skipped=len(kept), num_done_before=num_done_before, workers=workers
+        )
         self._store.make()
+        self._store.remove_partials()
         self._forget_attempts()
         self._store.write_text(CONFIG, settings_to_toml(self.task.config))
         self._account(report, finished=False)

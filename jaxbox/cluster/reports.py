@@ -70,6 +70,8 @@ class DatasetReport:
     """In the order of the sweeps; those that an earlier run finished among them."""
     num_skipped: int = 0
     """Partitions that an earlier run had finished."""
+    num_done_before: int = 0
+    """Sweeps that are done in those."""
     interrupted: bool = False
     """Whether it was ended before its last partition."""
     workers: int = 0
@@ -107,6 +109,7 @@ class DatasetReport:
             "num_partitions": len(self.partitions),
             "num_skipped": self.num_skipped,
             "num_done": self.num_done,
+            "num_done_before": self.num_done_before,
             "num_failed": sum(len(part.failures) for part in self.partitions),
             "num_boxes": self.num_boxes,
             "workers": self.workers,

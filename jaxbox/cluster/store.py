@@ -10,6 +10,8 @@ from typing import Any, BinaryIO
 
 from jaxbox.io._extras import require
 
+_PARTIAL = ".part"
+
 
 class Store:
     """A folder, local or at any URL that fsspec knows. It can be pickled."""
@@ -55,7 +57,7 @@ class Store:
         """Lends a local path, and makes a file of the folder of it once the block has ended well.
 
         The file is sent under a hidden name and then renamed, so that it never stands there in part:
-        whoever is killed leaves it as it was.
+        whoever is killed leaves it as it was, and what it sent in part for `remove_partials`.
 
         Args:
           name: of the file.
@@ -63,7 +65,7 @@ class Store:
         Yields:
           Where the file is to be written, on the local disk.
         """
-        partial = self._path(f".{name}.{uuid.uuid4().hex}.part")
+        partial = self._path(f".{name}.{uuid.uuid4().hex}{_PARTIAL}")
         with tempfile.TemporaryDirectory(prefix="jaxbox-") as folder:
             path = pathlib.Path(folder) / name
             yield path
@@ -85,6 +87,12 @@ class Store:
         """Removes a file, where it is there."""
         with contextlib.suppress(FileNotFoundError):
             self._system.rm_file(self._path(name))
+
+    def remove_partials(self) -> None:
+        """Removes what was sent in part by writers that were killed; nobody may be writing meanwhile."""
+        for name in self.names():
+            if name.startswith(".") and name.endswith(_PARTIAL):
+                self.remove(name)
 
     def _path(self, name: str) -> str:
         return f"{self._root.rstrip('/')}/{name}"

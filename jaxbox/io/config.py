@@ -8,7 +8,7 @@ from typing import Any
 
 from jaxbox.config import DetectorConfig
 from jaxbox.io._files import InputError, atomic_writer, read_text, reason
-from jaxbox.settings import apply_settings, base_of, settings_to_toml, without_base
+from jaxbox.settings import PRESET_KEY, apply_settings, base_of, settings_to_toml, without_base
 
 _MAX_BYTES = 2**20
 
@@ -35,6 +35,21 @@ def read_config(
         return apply_settings(base_of(tables, preset=base, sensor=sensor), without_base(tables))
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def read_preset(path: str | os.PathLike[str]) -> str:
+    """Reads which preset a settings file changes.
+
+    Args:
+      path: as `read_config`, which refuses a name that is no preset's.
+
+    Returns:
+      What it names under ``preset``, or "default".
+
+    Raises:
+      InputError: naming the file, where it is no settings file.
+    """
+    return _parse(path).get(PRESET_KEY, "default")
 
 
 def write_config(path: str | os.PathLike[str], config: DetectorConfig) -> None:

@@ -31,14 +31,41 @@ def read_image(path: str | os.PathLike[str]) -> np.ndarray:
       InputError: where it is missing, cannot be decoded, or claims more than `MAX_PIXELS`.
     """
     data = read_bytes(path)
+    _checked_size(data, path)
+    # As it is stored, which is what the calibration is of, whatever turn the file proposes to viewers.
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    # OpenCV answers None to what it cannot decode.
+    if image is None:
+        raise _unreadable(path)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def read_image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
+    """Reads how large a camera image is, without decoding it.
+
+    Args:
+      path: a PNG or JPEG file.
+
+    Returns:
+      Width and height, px, those of `read_image`.
+
+    Raises:
+      InputError: where it is missing, its head is of neither format, or it claims more than `MAX_PIXELS`.
+    """
+    return _checked_size(read_bytes(path), path)
+
+
+def _checked_size(data: bytes, path: str | os.PathLike[str]) -> tuple[int, int]:
     width, height = _claimed_size(data)
     if width * height > MAX_PIXELS:
         raise InputError(f"{path}: it claims {width} x {height} pixels; at most {MAX_PIXELS} are read.")
-    # OpenCV answers None to what it cannot decode.
-    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if width * height else None
-    if image is None:
-        raise InputError(f"{path}: not a readable image; copy it again, or remove it to go on without.")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    if not width * height:
+        raise _unreadable(path)
+    return width, height
+
+
+def _unreadable(path: str | os.PathLike[str]) -> InputError:
+    return InputError(f"{path}: not a readable image; copy it again, or remove it to go on without.")
 
 
 def _claimed_size(data: bytes) -> tuple[int, int]:

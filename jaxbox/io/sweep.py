@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from jaxbox.io._files import InputError
-from jaxbox.io.images import read_image
+from jaxbox.io.images import read_image, read_image_size
 from jaxbox.io.kitti import KittiObject, read_labels
 from jaxbox.io.kitti_calibration import IMAGE_SIZE_PX, read_calibration, read_raw_calibration
 from jaxbox.io.points import Points
@@ -80,12 +80,11 @@ class Sweep:
           is no image. None where the sweep has no calibration.
 
         Raises:
-          InputError: naming the file, where it or the image cannot be read.
+          InputError: naming the file, where it or the image's size cannot be read.
         """
         if self.calibration_path is None:
             return None
-        image = self.read_image()
-        size = None if image is None else (image.shape[1], image.shape[0])
+        size = None if self.image_path is None else read_image_size(self.image_path)
         if self.calibration_path.is_dir():
             return read_raw_calibration(self.calibration_path, image_size_px=size)
         return read_calibration(self.calibration_path, image_size_px=size or IMAGE_SIZE_PX)

@@ -21,6 +21,10 @@ OWNER_CHUNK = 4096
 INSIDE_TOLERANCE_M = 1e-3
 """A point on the face of its box is inside."""
 
+GROUND_ABOVE_M = 0.5
+"""A ground plane that passes so high over the origin lies above the sensor: where recordings are in their
+vehicle's frame, with the origin on the ground, it is off by bumps and slopes alone."""
+
 
 def conclude(
     cloud: PointCloud,
@@ -196,5 +200,6 @@ def _status(
         Status.CANDIDATE_OVERFLOW: counts.candidates > settings.max_candidates,
         Status.DETECTION_OVERFLOW: counts.detections > settings.max_detections,
         Status.HULL_OVERFLOW: counts.hull_vertices > config.hull.max_vertices,
+        Status.GROUND_ABOVE: heights.plane.found & (heights.plane.coefficients[2] > GROUND_ABOVE_M),
     }
     return sum((jnp.where(is_set, jnp.int32(bit), 0) for bit, is_set in bits.items()), jnp.int32(0))
