@@ -9,6 +9,8 @@ import dataclasses
 
 import numpy as np
 
+from jaxbox.types import GROUND_ABOVE_M
+
 NEAR_M, FAR_M = 3.0, 30.0
 """The ground is fitted to points so far away: nearer ones are the carrier, farther ones other roads."""
 MAX_TILT_DEG = 35.0
@@ -41,6 +43,11 @@ class Mounting:
     def tilt_deg(self) -> float:
         """Between z and the ground's normal, in [0, 180]."""
         return float(np.degrees(np.arctan2(np.hypot(*self.up[:2]), self.up[2])))
+
+    @property
+    def is_upside_down(self) -> bool:
+        """Whether the ground lies clearly above the sensor, as `Status.GROUND_ABOVE` says."""
+        return self.height_m is not None and self.height_m < -GROUND_ABOVE_M
 
     @property
     def T_level_points(self) -> np.ndarray:

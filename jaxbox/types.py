@@ -26,6 +26,11 @@ if TYPE_CHECKING:
     from jaxbox.summary import Summary
 
 
+GROUND_ABOVE_M = 0.5
+"""A ground plane that passes so high over the origin lies above the sensor: where recordings are in their
+vehicle's frame, with the origin on the ground, it is off by bumps and slopes alone."""
+
+
 class Status(enum.IntFlag):
     """What happened to a sweep. Zero is a clean run; each bit is explained by `describe`."""
 

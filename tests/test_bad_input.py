@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks import bad_input, bench_bad_input, common
 from jaxbox import DetectorConfig, PointCloud, Status, detect
-from jaxbox.steps.answer import GROUND_ABOVE_M
+from jaxbox.types import GROUND_ABOVE_M
 
 CASES = {case.name: case for case in bad_input.CASES}
 HERE = [case.name for case in bad_input.CASES if not case.compiles_anew]

@@ -107,3 +107,9 @@ def test_sweeps_without_a_ground_are_refused(tmp_path):
     io.write_bin(tmp_path / "a.bin", np.eye(3, dtype=np.float32), np.zeros(3, np.float32))
     with pytest.raises(io.InputError, match="no ground round the sensor"):
         io.measure_sweeps(io.open_sweeps(tmp_path / "a.bin"))
+
+
+def test_an_upside_down_sensor_is_not_seen_upright_but_named(tmp_path):
+    io.write_bin(tmp_path / "a.bin", SWEEP.xyz * [1, -1, -1])
+    with pytest.raises(io.InputError, match=r"ground lies 1\.7. m above the sensor"):
+        io.measure_sweeps(io.open_sweeps(tmp_path / "a.bin"))

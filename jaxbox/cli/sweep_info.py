@@ -14,6 +14,7 @@ from jaxbox.mounting import MIN_SENSOR_HEIGHT_M, Mounting, measure_mounting
 from jaxbox.padding import fitting_capacity
 from jaxbox.sensors import TUNED_BEAMS, fitting_sensor
 from jaxbox.settings import changed_settings
+from jaxbox.types import GROUND_ABOVE_M
 
 NUM_BEAMS = (16, 32, 40, 64, 80, 128)
 """What spinning sensors have."""
@@ -257,7 +258,7 @@ def advised_options(infos: Sequence[SweepInfo], beams: int) -> list[str]:
     tilts = np.array([info.tilt_deg for info in infos if info.tilt_deg is not None])
     options = [] if beams == TUNED_BEAMS else ["--sensor", str(beams)]
     heights = [info.sensor_height_m for info in infos if info.sensor_height_m is not None]
-    low = any(height < MIN_SENSOR_HEIGHT_M for height in heights)
+    low = any(-GROUND_ABOVE_M <= height < MIN_SENSOR_HEIGHT_M for height in heights)
     tilted = len(tilts) > 0 and np.median(tilts) > MAX_LEVEL_TILT_DEG
     return options + ([LEVEL_OPTION] if low or tilted else [])
 
@@ -286,12 +287,13 @@ def describe(info: SweepInfo) -> list[str]:
     beams += f", {info.spacing_deg:.2f} degrees apart" if info.spacing_deg else ""
     down, up = info.elevation_deg
     lines.append(f"  {beams}, elevation {down:.1f} to {up:.1f} degrees")
-    if info.sensor_height_m is None:
-        lines.append("  no ground plane round the sensor: is z up, and the sensor at the origin?")
-    else:
-        height, tilt = info.sensor_height_m, info.tilt_deg
-        lines.append(f"  sensor {height:.2f} m above the ground, tilted {tilt:.1f} degrees")
-    if info.sensor_height_m is not None and info.sensor_height_m < MIN_SENSOR_HEIGHT_M:
+    height = info.sensor_height_m
+    if height is None:
+        return [*lines, "  no ground plane round the sensor: is z up, and the sensor at the origin?"]
+    if height < -GROUND_ABOVE_M:
+        return [*lines, f"  the ground lies {-height:.2f} m above the sensor: upside down, or z points down?"]
+    lines.append(f"  sensor {height:.2f} m above the ground, tilted {info.tilt_deg:.1f} degrees")
+    if height < MIN_SENSOR_HEIGHT_M:
         lines.append(
             "  the origin is close to the ground: is this a vehicle's frame? The detector looks from the "
             "origin: --level lifts it to a roof's height, --sensor-at X Y Z says exactly where the sensor is"

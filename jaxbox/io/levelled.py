@@ -89,7 +89,7 @@ def measure_sweeps(
       The mounting.
 
     Raises:
-      InputError: where none of them can be read and shows a ground.
+      InputError: where none of them can be read and shows a ground, or it lies above the sensor.
     """
     # Every so many: a recording is passed once.
     some = sweeps[:: -(-len(sweeps) // NUM_MEASURED)]
@@ -103,7 +103,13 @@ def measure_sweeps(
     up = np.median([mounting.up for mounting in seen], axis=0)
     x, y, z = (float(value) for value in up / np.linalg.norm(up))
     heights_m = [mounting.height_m for mounting in seen if mounting.height_m is not None]
-    mounting = Mounting(position, (x, y, z), float(np.median(heights_m)))
+    height_m = float(np.median(heights_m))
+    mounting = Mounting(position, (x, y, z), height_m)
+    if mounting.is_upside_down:
+        raise InputError(
+            f"{sweeps[0].name}: the ground lies {-height_m:.2f} m above the sensor. Does it hang upside "
+            "down, or does z point down? Turn the points over first."
+        )
     # A position that was given is meant.
     return mounting if any(position) else mounting.raised()
 

@@ -13,17 +13,13 @@ from jaxbox.steps.boxes import HULL_CHUNK, Fits, max_slab_points, trace_hulls
 from jaxbox.steps.decision import Candidates
 from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals
-from jaxbox.types import Counts, Descriptors, Detections, Hulls, PointCloud, Status
+from jaxbox.types import GROUND_ABOVE_M, Counts, Descriptors, Detections, Hulls, PointCloud, Status
 
 OWNER_CHUNK = 4096
 """Points whose detections are looked up at a time."""
 
 INSIDE_TOLERANCE_M = 1e-3
 """A point on the face of its box is inside."""
-
-GROUND_ABOVE_M = 0.5
-"""A ground plane that passes so high over the origin lies above the sensor: where recordings are in their
-vehicle's frame, with the origin on the ground, it is off by bumps and slopes alone."""
 
 
 def conclude(
