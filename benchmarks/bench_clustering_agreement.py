@@ -111,6 +111,7 @@ def bench(folder: pathlib.Path, config: DetectorConfig, radii: Sequence[float]) 
     """One row a sweep and radius."""
     gates: dict[str, Any] = {
         "min_points": config.clustering.min_points,
+        "min_extent_m": config.vehicles.min_extent_m,
         "max_extent_m": config.clustering.max_extent_m,
     }
     rows = []

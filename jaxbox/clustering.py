@@ -382,15 +382,17 @@ def select_clusters(
     *,
     max_clusters: Sequence[int],
     min_points: jax.Array | float,
+    min_extent_m: jax.Array | float,
     max_extent_m: jax.Array | float,
 ) -> Clusters:
-    """Keeps the components that may be a vehicle: enough points, and not too long.
+    """Keeps the components that may be a vehicle: enough points, not too short, and not too long.
 
     Args:
       statistics: of the C components.
       first: (maps + 1,) int32, see `Components`.
       max_clusters: static, of each map; the clusters beyond it are left out.
       min_points: least number of points.
+      min_extent_m: least diagonal of the extents along x and y, m: no rectangle has a longer side.
       max_extent_m: greatest extent along x and along y, m.
 
     Returns:
@@ -400,7 +402,9 @@ def select_clusters(
     upper, num_points = statistics.upper, statistics.count[:, 0]
     component = jnp.arange(num_points.shape[0])
     keep = (num_points >= jnp.maximum(min_points, 1)) & (component >= first[0]) & (component < first[-1])
-    keep = keep & jnp.all(upper[:, :2] + upper[:, 3:5] <= max_extent_m, axis=1)
+    extent_x, extent_y = upper[:, 0] + upper[:, 3], upper[:, 1] + upper[:, 4]
+    keep = keep & (jnp.maximum(extent_x, extent_y) <= max_extent_m)
+    keep = keep & (extent_x**2 + extent_y**2 >= min_extent_m**2)
     keep, order = store((keep, prefix_sum(keep)), first[0] >= 0)
     end = lookup(order, first - 1)
     found = end[1:] - end[:-1]

@@ -310,7 +310,7 @@ class VehicleConfig:
     top_grade: Scalar = 0.0075
     """A top may be higher than that of its points by this times the range: the beams' spacing."""
     min_extent_m: Scalar = 1.0
-    """Boxes with both measured extents shorter than this are no vehicle."""
+    """Boxes with no measured extent as long as this, and clusters with such a diagonal, are no vehicle."""
     saturation_points: Scalar = 100.0
     """Clusters with at least so many points lose no score for sparseness."""
     sparseness_power: Scalar = 0.3

@@ -34,6 +34,8 @@ def pytest_configure(config: pytest.Config) -> None:
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """With `-n`, of one file all tests run in one process: they share compiled functions."""
+    # Files in their order: by the number of their tests, the slowest, with few, would all come last.
+    config.option.loadscopereorder = False
     return importlib.import_module("xdist.scheduler").LoadFileScheduling(config, log)
 
 

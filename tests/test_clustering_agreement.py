@@ -45,6 +45,7 @@ def test_a_cluster_is_the_same_only_where_both_share_nine_tenths_of_it(bench):
 def test_grid_components_of_real_sweeps_agree_with_euclidean_clusters(bench, data_root):
     config = DetectorConfig.paper()
     gates = parity.select_options(config.clustering, "min_points", "max_extent_m")
+    gates |= parity.select_options(config.vehicles, "min_extent_m")
     for case in parity.real_cases(data_root)[2:4]:
         xyz, component = bench.grid_components(case.xyz, config)
         result = bench.agreement(xyz, component, radius_m=RADIUS_M, gates=gates)

@@ -17,6 +17,7 @@ SETTINGS = parity.CONFIG.clustering
 WARP = {"start_m": SETTINGS.adaptive_start_m, "growth": SETTINGS.adaptive_growth}
 MAPS = {"bird's-eye view": ComponentMap(cell_m=0.35), "3D": DetectorConfig.paper().clustering.maps[0]}
 GATES = parity.select_options(SETTINGS, "min_points", "max_extent_m")
+GATES |= parity.select_options(parity.CONFIG.vehicles, "min_extent_m")
 MAX_RUNS = 2**14
 
 
@@ -190,7 +191,7 @@ def test_the_lists_of_the_maps_join_without_gaps_and_end_at_their_capacities():
     ):
         clusters = select_clusters(
             [component], xy, np.zeros(11), np.ones(11, bool), np.array([1, 5, 7, 10]), max_clusters=sizes,
-            min_points=1.0, max_extent_m=12.0,
+            min_points=1.0, min_extent_m=0.0, max_extent_m=12.0,
         )  # fmt: skip
         none = sum(sizes)
         assert clusters.found.tolist() == [3, 2, 2]

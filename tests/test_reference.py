@@ -302,12 +302,12 @@ def test_warp_keeps_directions_and_near_points_and_grows_the_linking_distance_li
 
 
 def test_size_gates_keep_their_limits_and_number_what_is_left_in_order():
-    component = np.repeat([0, 1, 2, 3], [3, 8, 8, 9])
-    xy = np.zeros((28, 2))
-    xy[3, 1], xy[11, 0] = 12.0, 12.5
-    slot, count = reference.keep_clusters(xy, component, min_points=8, max_extent_m=12.0)
+    component = np.repeat([0, 1, 2, 3, 4], [3, 8, 8, 9, 8])
+    xy = np.zeros((36, 2))
+    xy[3, 1], xy[11, 0], xy[19], xy[28] = 12.0, 12.5, (0.6, 0.8), (0.6, 0.7)
+    slot, count = reference.keep_clusters(xy, component, min_points=8, min_extent_m=1.0, max_extent_m=12.0)
     assert count == 2
-    assert slot.tolist() == [-1] * 3 + [0] * 8 + [-1] * 8 + [1] * 9
+    assert slot.tolist() == [-1] * 3 + [0] * 8 + [-1] * 8 + [1] * 9 + [-1] * 8
 
 
 # ---------------------------------------------------------------- hull, rectangle, descriptors

@@ -157,8 +157,8 @@ SMALL = DetectorConfig(
     ground=GroundConfig(surface=False),
     clustering=ClusteringConfig(
         maps=(
-            ComponentMap(cell_m=0.35, max_cells=640, max_clusters=40),
-            ComponentMap(cell_m=0.5, max_cells=480, max_clusters=40),
+            ComponentMap(cell_m=0.35, max_cells=640, max_clusters=16),
+            ComponentMap(cell_m=0.5, max_cells=480, max_clusters=16),
         ),
         max_obstacles=6500,
     ),
@@ -166,7 +166,7 @@ SMALL = DetectorConfig(
     hull=HullConfig(max_vertices=8),
     box=BoxConfig(scene_direction=False, num_angles=18, max_slab_points=1900),
     completion=CompletionConfig(mode="none"),
-    vehicles=VehicleConfig(max_large=30, max_candidates=8, max_detections=3),
+    vehicles=VehicleConfig(max_large=8, max_candidates=4, max_detections=2),
 )
 CAPACITY_BITS = (
     Status.OBSTACLE_OVERFLOW

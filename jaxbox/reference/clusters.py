@@ -107,7 +107,7 @@ def count_runs(cells: np.ndarray, shape: tuple[int, int, int]) -> int:
 
 
 def keep_clusters(
-    xy: np.ndarray, component: np.ndarray, *, min_points: float, max_extent_m: float
+    xy: np.ndarray, component: np.ndarray, *, min_points: float, min_extent_m: float, max_extent_m: float
 ) -> tuple[np.ndarray, int]:
     """Numbers the components that pass the size gates.
 
@@ -115,6 +115,7 @@ def keep_clusters(
       xy: (n, 2) m, true, not warped.
       component: (n,) int, from 0.
       min_points: components with fewer points are left out.
+      min_extent_m: components whose extents along x and y have a shorter diagonal are left out.
       max_extent_m: components longer along x or y are left out.
 
     Returns:
@@ -129,6 +130,7 @@ def keep_clusters(
         for axis in range(2)
     ]
     kept = (np.bincount(component) >= min_points) & (np.max(extents, axis=0) <= max_extent_m)
+    kept &= np.hypot(*extents) >= min_extent_m
     slot = np.where(kept, np.cumsum(kept) - 1, NO_CLUSTER)
     return slot[component], int(kept.sum())
 

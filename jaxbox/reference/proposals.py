@@ -134,6 +134,7 @@ def find_clusters(
     slot = np.full(len(member), NO_CLUSTER)
     component[member] = label_components(cells, shape)
     gates = select_options(clustering, "min_points", "max_extent_m")
+    gates |= select_options(settings.vehicles, "min_extent_m")
     slot[member], num_clusters = keep_clusters(xy, component[member], **gates)
     slot[slot >= fields.max_clusters] = NO_CLUSTER
     return component, slot, (count_runs(cells, shape), num_clusters)

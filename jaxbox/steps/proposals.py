@@ -57,6 +57,7 @@ def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Proposals:
         components.first,
         max_clusters=[m.max_clusters for m in maps],
         min_points=settings.min_points,
+        min_extent_m=config.vehicles.min_extent_m,
         max_extent_m=settings.max_extent_m,
     )
     all_fitted = clusters.num_slab < config.box.min_slab_points
