@@ -1,7 +1,9 @@
 """Parity with the reference and OpenCV: hulls, rectangles, the scene's direction, descriptors."""
 
+import dataclasses
 import functools
 import math
+import types
 
 import cv2
 import jax
@@ -10,7 +12,8 @@ import numpy as np
 import parity
 import pytest
 
-from jaxbox import box, descriptors, hull, reference
+from jaxbox import DetectorConfig, box, descriptors, hull, reference, steps
+from jaxbox.config import HullConfig
 from jaxbox.masked import map_rows
 
 SETTINGS = parity.CONFIG.box
@@ -259,3 +262,20 @@ def test_descriptors_of_a_rectangle_of_points_and_of_none_are_those_worked_by_ha
     np.testing.assert_allclose(found.eccentricity, [2, 1])
     np.testing.assert_allclose(found.density, [0.5, 0])
     np.testing.assert_allclose(found.complexity, [1, 0])
+
+
+def test_a_hull_beyond_its_capacity_is_fitted_to_by_its_own_vertices():
+    config = dataclasses.replace(DetectorConfig.paper(), hull=HullConfig(max_vertices=4))
+    angle = np.arange(40) * (2 * np.pi / 40)
+    disc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    away = np.array([10, 0])
+    obstacles = types.SimpleNamespace(xy=jnp.float32(np.concatenate([disc + away, disc - away])))
+    proposals = types.SimpleNamespace(
+        cluster=jnp.repeat(jnp.arange(2), 40)[None], num_points=jnp.array([40, 40]), num_clusters=jnp.int32(2)
+    )
+    fits = jax.jit(lambda: steps.fit_rectangles(obstacles, proposals, config))()
+    assert int(fits.hull_vertices) == 40
+    assert fits.points.count.tolist() == [4, 4]
+    x, _, _ = fits.points.table(jnp.arange(2))
+    assert (x[:, 0] > 8).all()
+    assert (x[:, 1] < -8).all()

@@ -82,7 +82,8 @@ def _hull_points(
     vertices, count = map_rows(trace, index, num_rows=proposals.num_clusters, chunk=HULL_CHUNK)
     x, y = vertices.reshape(-1, 2).T
     start = jnp.arange(count.shape[0]) * config.hull.max_vertices
-    return box.PointLists(x, y, start, count, config.hull.max_vertices), jnp.max(count)
+    listed = jnp.minimum(count, config.hull.max_vertices)
+    return box.PointLists(x, y, start, listed, config.hull.max_vertices), jnp.max(count)
 
 
 def trace_hulls(xy: jax.Array, index: jax.Array, *, max_vertices: int) -> tuple[jax.Array, jax.Array]:
