@@ -25,8 +25,10 @@ _NUM_HEADER_BYTES = 375
 """Of the longest header, that of LAS 1.4."""
 _VLR_BYTES, _EVLR_BYTES = 54, 60
 """Least size of a variable length record, and of an extended one."""
-_LASZIP_RECORD, _ITEMS = 22204, 32
-"""The record of a LAZ file that says how points are packed, and where in it their items are listed."""
+_LASZIP_RECORD, _CHUNK_POINTS, _ITEMS = 22204, 12, 32
+"""The record of a LAZ file that says how points are packed; in it, the points of a chunk, and the items."""
+_CHUNKS_DIFFER = 2**32 - 1
+"""Instead of the points of a chunk: the table of chunks says how many each has."""
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 """Layers of the items of LAS 1.4: point, colours, colours with infrared, waveform."""
 _EXTRA_BYTES = 14
@@ -80,7 +82,8 @@ def _check_tables(path: pathlib.Path, size: int) -> None:
         header = file.read(_NUM_HEADER_BYTES).ljust(_NUM_HEADER_BYTES, b"\0")
         start, num_vlrs, point_format = struct.unpack_from("<IIB", header, 96)
         check_num_bytes(num_vlrs * _VLR_BYTES, size, str(path))
-        if header[24:26] >= b"\1\4":
+        # Whatever the major version, laspy goes by the minor one.
+        if header[25] >= 4:
             (num_evlrs,) = struct.unpack_from("<I", header, 243)
             check_num_bytes(num_evlrs * _EVLR_BYTES, size, str(path))
         if point_format < _COMPRESSED:
@@ -98,13 +101,16 @@ def _check_tables(path: pathlib.Path, size: int) -> None:
 
 
 def _check_layers(path: pathlib.Path, header: Any, size: int) -> None:
-    """Holds the layers of LAZ chunks against the file's size; the decoder allocates what each claims.
+    """Holds LAZ chunks against a bound, and their layers against the file's size: the decoder allocates both.
 
     Reference: Isenburg, "LASzip: lossless compression of LiDAR data", 2013, and the LAZ 1.4 specification: a
     chunk is a point, the number of points, the size of each layer, and the layers.
     """
     lazrs = require("lazrs", extra="las", what="LAZ files")
     (record,) = [vlr.record_data for vlr in header.vlrs if vlr.record_id == _LASZIP_RECORD]
+    (chunk_points,) = struct.unpack_from("<I", record, _CHUNK_POINTS)
+    if chunk_points != _CHUNKS_DIFFER:
+        check_unpacked(chunk_points * header.point_format.size, str(path))
     (num_items,) = struct.unpack_from("<H", record, _ITEMS)
     items = [struct.unpack_from("<HH", record, _ITEMS + 2 + 6 * index) for index in range(num_items)]
     num_layers = sum(num_bytes if kind == _EXTRA_BYTES else _LAYERS.get(kind, 0) for kind, num_bytes in items)
