@@ -231,8 +231,8 @@ def _judge(
     share = height / max_height - LOWEST_LEVEL
     level = jnp.minimum(share * (NUM_LEVELS / (1 - LOWEST_LEVEL)), NUM_LEVELS - 1).astype(jnp.int32)
     level = jnp.where(inside & low & (share > 0), level, NUM_LEVELS)
-    bit, word = 1 << level % NUM_KINDS * COUNT_BITS, level // NUM_KINDS
-    words += [jnp.where(word == k, bit, 0) for k in range(NUM_LEVELS // NUM_KINDS)]
+    bit, place = 1 << level % NUM_KINDS * COUNT_BITS, level // NUM_KINDS
+    words += [jnp.where(place == k, bit, 0) for k in range(NUM_LEVELS // NUM_KINDS)]
     # Heights are not negative, and the bits of such numbers are in their order: integers' maxima vectorise.
     highest = jax.lax.bitcast_convert_type(jnp.where(inside & low, height, 0), jnp.int32)
     counts = jnp.stack([jnp.sum(word, axis=1) for word in words], axis=1)

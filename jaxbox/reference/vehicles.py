@@ -115,9 +115,8 @@ def top_of(height: np.ndarray, max_height_m: float, stray_share: float) -> float
         return 0.0
     edges = np.linspace(LOWEST_LEVEL * max_height_m, max_height_m, NUM_LEVELS + 1)
     left = stray_share * len(height)
-    for count, low, high in reversed(
-        list(zip(np.histogram(height, edges)[0], edges, edges[1:], strict=False))
-    ):
+    counts, _ = np.histogram(height, edges)
+    for count, low, high in zip(counts[::-1], edges[-2::-1], edges[:0:-1], strict=True):
         if count > left:
             return float(min(high - (high - low) * left / count, height.max()))
         left -= count
