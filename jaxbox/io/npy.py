@@ -4,6 +4,7 @@ import math
 import os
 import pathlib
 import tokenize
+import warnings
 import zipfile
 import zlib
 from typing import Any, BinaryIO
@@ -21,7 +22,8 @@ _READ_ERRORS = (
     ValueError, OSError, EOFError, KeyError, MemoryError, NotImplementedError, OverflowError, RuntimeError,
     SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
-"""What NumPy and its parsers raise on broken bytes."""
+"""What NumPy and its parsers raise on broken bytes. What they warn of, Python 2 and old names of types,
+does no harm to the values."""
 
 
 def read_npy(path: str | os.PathLike[str]) -> Points:
@@ -40,7 +42,8 @@ def read_npy(path: str | os.PathLike[str]) -> Points:
     try:
         # A map, so that a header that claims more than the file holds asks for no memory; and not
         # `np.load`, which takes archives and pickles too.
-        points = np.lib.format.open_memmap(path, mode="r")
+        with warnings.catch_warnings(action="ignore"):
+            points = np.lib.format.open_memmap(path, mode="r")
     except _READ_ERRORS as error:
         if _is_empty_array(path):
             return np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
@@ -53,7 +56,7 @@ def read_npy(path: str | os.PathLike[str]) -> Points:
 def _is_empty_array(path: str | os.PathLike[str]) -> bool:
     """Whether this is a whole file of an array without values, which cannot be mapped."""
     try:
-        with pathlib.Path(path).open("rb") as file:
+        with pathlib.Path(path).open("rb") as file, warnings.catch_warnings(action="ignore"):
             return 0 in _read_header(file)[0]
     except _READ_ERRORS:
         return False
@@ -75,7 +78,11 @@ def read_npz(path: str | os.PathLike[str]) -> Points:
     """
     check_file(path)
     try:
-        with pathlib.Path(path).open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+        with (
+            warnings.catch_warnings(action="ignore"),
+            pathlib.Path(path).open("rb") as file,
+            np.load(file, allow_pickle=False) as arrays,
+        ):
             if {"x", "y", "z"} <= set(arrays.files):
                 names = [name for name in _COLUMNS if name in arrays.files]
             else:
