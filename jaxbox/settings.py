@@ -8,7 +8,6 @@ dotted key reaches one value. `settings_to_toml` writes such a text, `settings_f
 """
 
 import ast
-import contextlib
 import dataclasses
 import difflib
 import json
@@ -273,7 +272,11 @@ def changed_settings(config: DetectorConfig, base: DetectorConfig) -> dict[str, 
 
 
 def differing_names(
-    config: DetectorConfig, options: Mapping[str, Any], *, earlier: DetectorConfig, account: str | bytes
+    config: DetectorConfig,
+    options: Mapping[str, Any],
+    *,
+    earlier: DetectorConfig,
+    recorded: Mapping[str, Any],
 ) -> list[str]:
     """Names of the settings and options in which a run differs from an earlier one that it would go on with.
 
@@ -281,17 +284,28 @@ def differing_names(
       config: the settings now.
       options: other options that the results depend on, now.
       earlier: the settings then.
-      account: JSON that the earlier run left, with its options under "options"; where it is broken, only
-        the settings are compared.
+      recorded: the options then.
 
     Returns:
       Dotted names and names of options; empty where nothing differs.
     """
-    names = list(changed_settings(earlier, config))
-    with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, RecursionError):
-        recorded = json.loads(account)["options"]
-        names += [name for name, value in options.items() if recorded.get(name) != value]
-    return names
+    other = [name for name, value in options.items() if recorded.get(name) != value]
+    return [*changed_settings(earlier, config), *other]
+
+
+def recorded_options(account: str | bytes) -> Mapping[str, Any]:
+    """The options that a run left in its account.
+
+    Args:
+      account: JSON with the options under "options".
+
+    Raises:
+      ValueError: where it is broken.
+    """
+    try:
+        return dict(json.loads(account)["options"])
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise ValueError("it does not say with which options the run was made") from error
 
 
 def parse_change(text: str) -> tuple[str, Any]:

@@ -1,8 +1,10 @@
 """`jaxbox detect` and `info` on other formats: what is written, resumed, interrupted and told to scripts."""
 
 import contextlib
+import errno
 import json
 import os
+import pathlib
 import signal
 
 import numpy as np
@@ -156,6 +158,22 @@ def test_resume_with_other_settings_or_a_file_that_cannot_be_continued_is_refuse
     result = detect(tmp_path, *common, "--resume", "--format", "rerun")
     assert result.exit_code == 2
     assert "detections.rrd cannot be continued" in result.stderr
+    for spoil in (lambda path: path.write_text('{"options": 1}'), pathlib.Path.unlink):
+        spoil(tmp_path / "run.json")
+        result = detect(tmp_path, *common, "--resume")
+        assert result.exit_code == 2
+        assert "run.json: --resume needs the options of the earlier run" in result.stderr
+    (tmp_path / "config.toml").unlink()
+    assert detect(tmp_path, *common, "--resume").exit_code == 0, "a run that was killed before it had begun"
+
+
+def test_settings_are_there_only_where_the_options_are_too(sweeps, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(io, "atomic_writer", full)
+    assert detect(tmp_path, sweeps / "c.bin", "--format", "jsonl").exit_code == 2
+    assert not (tmp_path / "config.toml").exists()
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -21,7 +21,7 @@ from jaxbox.io.points import Points
 from jaxbox.io.rerun import RERUN
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
 from jaxbox.mounting import Mounting
-from jaxbox.settings import differing_names
+from jaxbox.settings import differing_names, recorded_options
 from jaxbox.types import Calibration, Detections
 from jaxbox.versions import versions
 
@@ -192,13 +192,19 @@ class RunAccount:
         """Refuses to go on with other settings than those of the results that are there.
 
         Raises:
-          InputError: naming what differs.
+          InputError: naming what differs, or what is missing to tell.
         """
         if not (self.output / CONFIG_NAME).is_file():
             return
         earlier = io.read_config(self.output / CONFIG_NAME, base=self.config)
-        account = (self.output / RUN_NAME).read_bytes()
-        differing = differing_names(self.config, self.options, earlier=earlier, account=account)
+        try:
+            recorded = recorded_options((self.output / RUN_NAME).read_bytes())
+        except (OSError, ValueError) as error:
+            raise io.InputError(
+                f"{self.output / RUN_NAME}: --resume needs the options of the earlier run "
+                f"({getattr(error, 'strerror', error)}). Put the file back, or give another --output."
+            ) from error
+        differing = differing_names(self.config, self.options, earlier=earlier, recorded=recorded)
         if differing:
             raise io.InputError(
                 f"{self.output / CONFIG_NAME}: --resume needs the settings of the earlier run, and "
@@ -237,9 +243,10 @@ class RunAccount:
             **outcome,
         }
         with written(self.output / RUN_NAME):
-            io.write_config(self.output / CONFIG_NAME, self.config)
+            # The settings last: where they are, a run that was killed here left its options too.
             with io.atomic_writer(self.output / RUN_NAME) as handle:
                 handle.write(json.dumps(account, indent=2) + "\n")
+            io.write_config(self.output / CONFIG_NAME, self.config)
 
 
 def _mounting_record(mounting: Mounting) -> dict[str, Any]:

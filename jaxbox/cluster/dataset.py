@@ -22,7 +22,7 @@ from jaxbox.cluster.store import Store
 from jaxbox.cluster.worker import REPORT_KEY, SUFFIX, Partition, PartitionWorker, Task, is_attempt
 from jaxbox.config import DetectorConfig
 from jaxbox.io._extras import require
-from jaxbox.settings import differing_names, settings_from_toml, settings_to_toml
+from jaxbox.settings import differing_names, recorded_options, settings_from_toml, settings_to_toml
 from jaxbox.steps import check_settings
 from jaxbox.versions import versions
 
@@ -265,8 +265,11 @@ class _Run:
             earlier = settings_from_toml(text, base=self.task.config)
         except ValueError as error:
             raise io.InputError(f"{self.task.output}/{CONFIG}: {error}; give another output.") from error
-        account = self._store.read_text(MANIFEST) or ""
-        differing = differing_names(self.task.config, self._options, earlier=earlier, account=account)
+        recorded = self._options
+        # Without a manifest each partition still says for itself whether it was made with these options.
+        with contextlib.suppress(ValueError):
+            recorded = recorded_options(self._store.read_text(MANIFEST) or "")
+        differing = differing_names(self.task.config, self._options, earlier=earlier, recorded=recorded)
         if differing:
             raise io.InputError(
                 f"{self.task.output}: an earlier run had other settings: {', '.join(differing)} differ. Give "
