@@ -1,5 +1,6 @@
 """NumPy's own files: an array of points in .npy, or the array of that name in .npz."""
 
+import lzma
 import math
 import os
 import pathlib
@@ -20,7 +21,7 @@ ARRAY_NAMES = ("points", "xyz", "pointcloud", "data", "arr_0")
 _COLUMNS = ("x", "y", "z", "intensity")
 _READ_ERRORS = (
     ValueError, OSError, EOFError, KeyError, MemoryError, NotImplementedError, OverflowError, RuntimeError,
-    SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+    SyntaxError, lzma.LZMAError, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 """What NumPy and its parsers raise on broken bytes. What they warn of, Python 2 and old names of types,
 does no harm to the values."""

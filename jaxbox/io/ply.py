@@ -91,9 +91,12 @@ def _read_header(file: BinaryIO, where: str) -> tuple[str, int, np.dtype]:
 
 def _read_ascii(file: BinaryIO, count: int, dtype: np.dtype, where: str) -> np.ndarray:
     rows = read_number_lines(file, count, len(dtype.names or ()), where)
+    vertices = np.empty(count, dtype)
     # Numbers beyond their type's range.
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.rec.fromarrays(rows.T, dtype=dtype)
+        for name, values in zip(dtype.names or (), rows.T, strict=True):
+            vertices[name] = values
+    return vertices
 
 
 PLY = PointFormat(name="PLY", suffixes=(".ply",), read=read_ply)

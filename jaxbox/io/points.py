@@ -51,7 +51,7 @@ def named_points(columns: Mapping[str, np.ndarray], where: str) -> Points:
       As `jaxbox.io.read_points`.
 
     Raises:
-      InputError: where x, y or z is missing or is no number.
+      InputError: where x, y or z is missing or is no number, or fields have different numbers of values.
     """
     known = {name.lower(): values for name, values in columns.items()}
     if missing := [name for name in "xyz" if name not in known]:
@@ -61,13 +61,18 @@ def named_points(columns: Mapping[str, np.ndarray], where: str) -> Points:
         )
     if wrong := [name for name in "xyz" if known[name].dtype.kind not in "fiu" or known[name].ndim != 1]:
         raise InputError(f"{where}: field {wrong[0]} is not one real number a point.")
+    fields = {name: known[name] for name in "xyz"}
     intensity = next((known[name] for name in INTENSITY_NAMES if name in known), None)
+    if intensity is None or intensity.dtype.kind not in "fiu" or intensity.ndim != 1:
+        intensity = np.zeros(len(known["x"]), np.float32)
+    fields["intensity"] = intensity
+    if len({len(values) for values in fields.values()}) > 1:
+        sizes = ", ".join(f"{len(values)} of {name}" for name, values in fields.items())
+        raise InputError(f"{where}: {sizes}; each point needs one of each. Save them again.")
     # A number beyond float32's range becomes infinite, and is counted by the detector, as NaN of any kind.
     with np.errstate(over="ignore", invalid="ignore"):
-        xyz = np.stack([known[name].astype(np.float32) for name in "xyz"], axis=1)
-        if intensity is None or intensity.dtype.kind not in "fiu" or intensity.ndim != 1:
-            return xyz, np.zeros(len(xyz), np.float32)
-        return xyz, intensity.astype(np.float32)
+        x, y, z, intensity = (values.astype(np.float32) for values in fields.values())
+    return np.stack([x, y, z], axis=1), intensity
 
 
 def record_dtype(layout: Mapping[str, Any], where: str) -> np.dtype:
