@@ -53,7 +53,9 @@ def fill_rows(xyz: np.ndarray, intensity: np.ndarray, rows: np.ndarray, padded: 
     if len(xyz) > len(rows):
         keep = _nearest(xyz, len(rows))
         xyz, intensity = xyz[keep], intensity[keep]
-    rows[: len(xyz), :3] = xyz
+    # Column by column: NumPy copies rows of three numbers one row at a time.
+    for axis in range(3):
+        rows[: len(xyz), axis] = xyz[:, axis]
     rows[: len(xyz), 3] = 1
     rows[len(xyz) :] = 0
     padded[: len(xyz)] = intensity
