@@ -80,9 +80,11 @@ class Mounting:
         """
         T = self.T_level_points
         finite = np.isfinite(xyz).all(axis=1)
-        moved = np.array(xyz, np.float64)
-        moved[finite] = moved[finite] @ T[:3, :3].T + T[:3, 3]
-        return moved.astype(np.float32)
+        # Beyond float32's range numbers become infinite, and are counted by the detector, as NaN of any kind.
+        with np.errstate(over="ignore", invalid="ignore"):
+            moved = np.array(xyz, np.float32)
+            moved[finite] = xyz[finite].astype(np.float64) @ T[:3, :3].T + T[:3, 3]
+        return moved
 
 
 def measure_mounting(

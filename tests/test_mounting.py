@@ -63,6 +63,19 @@ def test_the_level_frame_has_the_sensor_at_its_origin_and_turns_no_heading():
     np.testing.assert_array_equal(Mounting().T_level_points, np.eye(4))
 
 
+def test_points_without_a_place_are_seen_upright_without_a_word():
+    mounting = Mounting((0.0, 0.0, 2.0), (0.1, 0.0, 0.99), 2.0)
+    signalling = np.array([0x7FA00000], np.uint32).view(np.float32)[0]
+    odd = [np.nan, np.inf, -np.inf, signalling, 3e38]
+    xyz = np.array([[value, 0, 0] for value in odd] + [[1, 2, 3]], np.float32)
+    moved = mounting.level(xyz)
+    assert moved.dtype == np.float32
+    np.testing.assert_array_equal(np.isnan(moved[:, 0]), np.isnan(xyz[:, 0]))
+    np.testing.assert_array_equal(moved[1:3], xyz[1:3])
+    T = mounting.T_level_points
+    np.testing.assert_allclose(moved[-1], T[:3, :3] @ [1, 2, 3] + T[:3, 3], rtol=1e-6)
+
+
 def test_an_origin_on_the_ground_is_lifted_to_a_roof_and_a_sensor_s_is_left():
     on_ground = measure_mounting(SWEEP.xyz + LIFT)
     assert abs(on_ground.height_m) < MIN_SENSOR_HEIGHT_M

@@ -22,7 +22,15 @@ from jaxbox.io._arrow_sizes import unpacked_bytes
 from jaxbox.io._extras import require
 from jaxbox.io._files import InputError, parse_json, read_bytes, read_text, reason
 from jaxbox.io.labelled import LabelledBoxes, check_count, finite_number, labelled_boxes
-from jaxbox.io.points import PointFormat, Points, check_num_points, check_unpacked, named_points, read_bin
+from jaxbox.io.points import (
+    PointFormat,
+    Points,
+    check_num_points,
+    check_unpacked,
+    named_points,
+    read_bin,
+    seen_from,
+)
 
 SENSOR_XYZ_M = (1.35, 0.0, 1.64)
 """The upper LiDAR in the vehicle's frame; cars of the fleet differ by centimetres."""
@@ -59,7 +67,7 @@ def read_argoverse2_points(
       InputError: as `read_bin`.
     """
     xyz, intensity = read_bin(path)
-    return xyz - np.asarray(sensor_xyz_m, np.float32), intensity
+    return seen_from(sensor_xyz_m, xyz), intensity
 
 
 def read_feather(path: str | os.PathLike[str]) -> Points:
@@ -82,7 +90,7 @@ def read_feather(path: str | os.PathLike[str]) -> Points:
     calibration = pathlib.Path(os.path.abspath(path)).parents[2:3]
     file = calibration[0] / "calibration" / "egovehicle_SE3_sensor.feather" if calibration else None
     sensor = _sensor_xyz_m(file) if file is not None and file.is_file() else SENSOR_XYZ_M
-    return xyz - np.asarray(sensor, np.float32), intensity
+    return seen_from(sensor, xyz), intensity
 
 
 def _sensor_xyz_m(path: pathlib.Path) -> np.ndarray:

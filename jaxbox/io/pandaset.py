@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxbox.io._files import InputError, read_text
 from jaxbox.io.labelled import LabelledBoxes, finite_number, labelled_boxes
-from jaxbox.io.points import read_bin
+from jaxbox.io.points import read_bin, seen_from
 
 SENSOR_XYZ_M = (0.8, 0.0, 1.85)
 """The sensor in the recordings' frame, to about a decimetre. From the data: seen from there, the rings on the
@@ -52,7 +52,7 @@ def read_pandaset_points(
       InputError: as `read_bin`.
     """
     xyz, intensity = read_bin(path)
-    return xyz - np.asarray(sensor_xyz_m, np.float32), intensity
+    return seen_from(sensor_xyz_m, xyz), intensity
 
 
 def read_pandaset_boxes(

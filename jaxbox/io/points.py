@@ -5,7 +5,7 @@ import dataclasses
 import os
 import pathlib
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -73,6 +73,20 @@ def named_points(columns: Mapping[str, np.ndarray], where: str) -> Points:
     with np.errstate(over="ignore", invalid="ignore"):
         x, y, z, intensity = (values.astype(np.float32) for values in fields.values())
     return np.stack([x, y, z], axis=1), intensity
+
+
+def seen_from(place: Sequence[float] | np.ndarray, xyz: np.ndarray) -> np.ndarray:
+    """Points from the place of a sensor with the same axes.
+
+    Args:
+      place: x, y and z, m.
+      xyz: (n, 3) float32, m.
+
+    Returns:
+      (n, 3) float32, m.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        return xyz - np.asarray(place, np.float32)
 
 
 def record_dtype(layout: Mapping[str, Any], where: str) -> np.dtype:
