@@ -253,15 +253,15 @@ def test_descriptors_are_those_of_the_reference(cases):
         assert np.all(ours.eccentricity[count:] == 1)
 
 
-def test_descriptors_of_a_rectangle_of_points_and_of_none_are_those_worked_by_hand():
-    # Sums of 1, x, y, x^2, y^2 and x y of the corners (+-2, +-1), then of nothing, beside what an earlier
-    # cluster of that row left behind.
-    moments = jnp.array([[4.0, 0, 0, 16, 4, 0], [0.0, 0, 0, 0, 0, 0]])
-    found = shape_descriptors(moments, jnp.array([8.0, 8.0]), jnp.array([4, 4]))
-    np.testing.assert_allclose(found.moment_of_inertia, [[4, 1], [0, 0]])
-    np.testing.assert_allclose(found.eccentricity, [2, 1])
-    np.testing.assert_allclose(found.density, [0.5, 0])
-    np.testing.assert_allclose(found.complexity, [1, 0])
+def test_descriptors_of_a_rectangle_a_point_and_none_are_those_worked_by_hand():
+    # Sums of 1, x, y, x^2, y^2 and x y of the corners (+-2, +-1), of one point, then of nothing, beside what
+    # an earlier cluster of that row left behind.
+    moments = jnp.array([[4.0, 0, 0, 16, 4, 0], [1.0, 3, 0, 9, 0, 0], [0.0, 0, 0, 0, 0, 0]])
+    found = shape_descriptors(moments, jnp.array([8.0, 0.0, 8.0]), jnp.array([4, 1, 4]))
+    np.testing.assert_allclose(found.moment_of_inertia, [[4, 1], [0, 0], [0, 0]])
+    np.testing.assert_allclose(found.eccentricity, [2, 1, 1])
+    np.testing.assert_allclose(found.density, [0.5, 0, 0])
+    np.testing.assert_allclose(found.complexity, [1, 1, 0])
 
 
 def test_a_hull_beyond_its_capacity_is_fitted_to_by_its_own_vertices():
