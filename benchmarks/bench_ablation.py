@@ -29,9 +29,6 @@ MORE_POINTS = {"clustering.max_obstacles": 131072, "box.max_slab_points": 65536}
 MORE_DETECTIONS = {"vehicles.max_detections": 512}
 """Room for rows that reject less."""
 
-_ONE_MAP = {"clustering.maps.1.max_height_m": 0.0}
-"""No point is low enough for the second component map."""
-
 COLUMNS = ("SOFT", "bev moderate", "3d moderate", "recall bev 0.5", "recall bev 0.7", "recall 3d 0.7")
 
 
@@ -44,15 +41,21 @@ class Ablation:
     """New values by dotted setting name."""
 
 
+def _without_maps(*indices: int) -> dict[str, Any]:
+    """No point is low enough for these component maps."""
+    return {f"clustering.maps.{index}.max_height_m": 0.0 for index in indices}
+
+
 ABLATIONS = (
     # Points.
     Ablation("no filter", {"filtering.enabled": False}),
     Ablation("one plane instead of the ground grid", {"ground.surface": False, **MORE_POINTS}),
     Ablation("ground grid of grade 0.2", {"ground.max_grade": 0.2}),
     # Proposals.
-    Ablation("one map: 0.13 m", _ONE_MAP),
-    Ablation("one map: 0.35 m", {"clustering.maps.0.cell_m": 0.35, **_ONE_MAP}),
-    Ablation("maps of 0.2 and 0.5 m", {"clustering.maps.0.cell_m": 0.2}),
+    Ablation("one map: 0.2 m", _without_maps(1, 2)),
+    Ablation("one map: 0.35 m", {"clustering.maps.0.cell_m": 0.35, **_without_maps(1, 2)}),
+    Ablation("maps without 0.1 m", _without_maps(1)),
+    Ablation("maps without 0.5 m", _without_maps(2)),
     Ablation("cells that do not grow with range", {"clustering.adaptive_growth": 0.0}),
     # Rectangle.
     Ablation("rectangle of points up to 2.0 m", {"box.slab_max_height_m": 2.0, **MORE_POINTS}),

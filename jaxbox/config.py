@@ -145,12 +145,13 @@ class ComponentMap:
 class ClusteringConfig:
     """Euclidean clustering on grids (paper, 3.2, Algorithm II).
 
-    Each map of the default preset is only a proposal: the finer one splits what the coarser one merges,
+    Each map of the default preset is only a proposal: a finer map splits what a coarser one merges,
     and the evidence for the boxes decides.
     """
 
     maps: tuple[ComponentMap, ...] = (
-        ComponentMap(cell_m=0.13, max_cells=9216),
+        ComponentMap(cell_m=0.2, max_cells=7168),
+        ComponentMap(cell_m=0.1, max_cells=10240, min_height_m=0.3, max_height_m=2.0),
         ComponentMap(cell_m=0.5, max_cells=4096),
     )
     """The component maps; the first also gives the scene direction and the components for display."""
@@ -372,9 +373,14 @@ class DetectorConfig:
 
     @classmethod
     def fast(cls) -> "DetectorConfig":
-        """One reading of each cluster instead of two: less time, a little less accuracy."""
+        """Two maps instead of three, and one reading of each cluster: less time, a little less accuracy."""
         base = cls()
-        return dataclasses.replace(base, completion=dataclasses.replace(base.completion, along_scene=False))
+        fine = ComponentMap(cell_m=0.13, max_cells=9216)
+        return dataclasses.replace(
+            base,
+            clustering=dataclasses.replace(base.clustering, maps=(fine, base.clustering.maps[2])),
+            completion=dataclasses.replace(base.completion, along_scene=False),
+        )
 
     @classmethod
     def presets(cls, *, num_beams: int = 64) -> dict[str, "DetectorConfig"]:

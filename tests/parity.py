@@ -123,12 +123,12 @@ class Case:
 
     @functools.cached_property
     def slot(self) -> np.ndarray:
-        """(m,) cluster of each obstacle in the coarsest map, which has most whole vehicles, -1 for none."""
-        return self.cluster_map(CONFIG.clustering.maps[-1])[1]
+        """(m,) cluster of each obstacle in the first map, -1 for none."""
+        return self.cluster_map(CONFIG.clustering.maps[0])[1]
 
     @functools.cached_property
     def proposals(self) -> list[Proposal]:
-        """Of that map."""
+        """Of the first map."""
         return make_proposals(self.obstacles, self.slot, CONFIG)
 
     @functools.cached_property

@@ -39,15 +39,15 @@ def test_each_traced_setting_reaches_its_own_leaf_and_no_other(config):
 
 def test_several_changes_are_made_together_and_the_rest_stays():
     base = DetectorConfig()
-    changed = replace_settings(base, {"box.criterion": "closeness", "clustering.maps.1.min_height_m": 0.4})
+    changed = replace_settings(base, {"box.criterion": "closeness", "clustering.maps.2.min_height_m": 0.4})
     assert changed.box == dataclasses.replace(base.box, criterion="closeness")
-    assert changed.clustering.maps[1].min_height_m == 0.4
-    assert changed.clustering.maps[:1] == base.clustering.maps[:1]
+    assert changed.clustering.maps[2].min_height_m == 0.4
+    assert changed.clustering.maps[:2] == base.clustering.maps[:2]
     assert changed.vehicles == base.vehicles
 
 
 def test_what_was_changed_is_what_changes_the_base_into_it():
-    changes = {"box.criterion": "closeness", "clustering.maps.1.min_height_m": 0.4, "box.max_slab_points": 9}
+    changes = {"box.criterion": "closeness", "clustering.maps.2.min_height_m": 0.4, "box.max_slab_points": 9}
     base = DetectorConfig()
     assert changed_settings(replace_settings(base, changes), base) == changes
     assert changed_settings(base, base) == {}
@@ -107,7 +107,8 @@ def test_tables_dotted_names_and_arrays_of_tables_say_the_same():
         DetectorConfig(), {"vehicles.min_score": 0.5, "clustering.maps.1.min_height_m": 0.4}
     )
     for text in (
-        "[vehicles]\nmin_score = 0.5\n[[clustering.maps]]\n[[clustering.maps]]\nmin_height_m = 0.4\n",
+        "[vehicles]\nmin_score = 0.5\n[[clustering.maps]]\n[[clustering.maps]]\nmin_height_m = 0.4\n"
+        "[[clustering.maps]]\n",
         "vehicles.min_score = 0.5\nclustering.maps.1.min_height_m = 0.4\n",
         '"vehicles.min_score" = 0.5\n"clustering.maps.1.min_height_m" = 0.4\n',
     ):
@@ -117,7 +118,7 @@ def test_tables_dotted_names_and_arrays_of_tables_say_the_same():
 def test_a_file_names_its_preset_and_its_arrays_set_their_length():
     assert settings_from_toml('preset = "paper"') == DetectorConfig.paper()
     assert settings_from_toml('preset = "paper"', base=DetectorConfig()) == DetectorConfig()
-    maps = settings_from_toml("[[clustering.maps]]\n" * 3).clustering.maps
+    maps = settings_from_toml("[[clustering.maps]]\n" * 4).clustering.maps
     assert maps == (*DetectorConfig().clustering.maps, ComponentMap())
     assert settings_from_toml('box.max_slab_points = "none"').box.max_slab_points is None
 

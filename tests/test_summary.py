@@ -109,10 +109,12 @@ def test_capacities_are_those_of_the_configuration_and_say_what_was_dropped(foun
     _, detections = found
     uses = {use.field: use for use in detections.summary().capacities}
     assert uses["clustering.max_obstacles"].capacity == 3 * CAPACITY // 4
-    assert uses["clustering.maps.1.max_cells"].capacity == DetectorConfig().clustering.maps[1].max_cells
+    assert uses["clustering.maps.2.max_cells"].capacity == DetectorConfig().clustering.maps[2].max_cells
     assert uses["vehicles.max_detections"].needed == detections.valid.sum()
     assert detections.summary().dropped == {}
-    small = DetectorConfig(clustering=ClusteringConfig(maps=(ComponentMap(max_cells=10), ComponentMap())))
+    small = DetectorConfig(
+        clustering=ClusteringConfig(maps=(ComponentMap(max_cells=10), ComponentMap(), ComponentMap()))
+    )
     # As a run with this capacity would have counted.
     cells = int(detections.counts.cells[0])
     assert detections.summary(small).dropped == {"clustering.maps.0.max_cells": cells - 10}
