@@ -125,7 +125,7 @@ def try_rotations(
 
     Returns:
       curve: (A, P) float32.
-      extents: four (A, P) float32, m: lower and upper bounds of u, then of v.
+      extents: four (A, P) float32, m: lower and upper bounds of u, then of v; 0 without points.
 
     Reference: paper, Algorithm III; oracles `jaxbox.reference.criterion_curve`, cv2.minAreaRect.
     """

@@ -183,6 +183,18 @@ def test_smallest_area_is_that_of_opencv_within_the_bound_of_the_step(cases):
         assert length * width - 1e-3 <= area <= length * width + bound + 1e-3
 
 
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_a_cluster_without_points_has_no_extents_and_a_finite_curve(criterion):
+    x, y = jnp.array([1.0, 2, 3]), jnp.array([1.0, 1, 2])
+    lists = box.PointLists(x, y, start=jnp.array([0, 3]), total=jnp.array([3, 0]), max_points=16)
+    options = {"criterion": criterion, "num_angles": 6, "min_distance_m": 0.05}
+    curve, extents = try_rotations(lists, jnp.arange(2), jnp.int32(2), **options)
+    u0, u1, v0, v1 = extents
+    assert np.isfinite(curve).all()
+    np.testing.assert_array_equal([(u1 - u0)[0, 0], (v1 - v0)[0, 0]], [2, 1])
+    np.testing.assert_array_equal(np.stack(extents)[:, :, 1], 0)
+
+
 def test_scene_direction_is_that_of_the_reference():
     rng = np.random.default_rng(0)
     options = {"num_angles": 90, "sigma_deg": SETTINGS.direction_sigma_deg}
