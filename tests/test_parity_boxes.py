@@ -102,6 +102,16 @@ def test_hulls_of_random_points_are_those_of_opencv(size):
         )
 
 
+def test_hulls_of_no_point_of_one_and_of_two_are_those_points():
+    points = np.array([[[5, 7], [5, 7], [9, 8]]] * 3, np.float32)
+    valid = np.array([[False] * 3, [True, True, False], [True] * 3])
+    vertices, count = trace_hulls(jnp.array(points), jnp.array(valid))
+    assert count.tolist() == [0, 1, 2]
+    np.testing.assert_array_equal(vertices[0], np.zeros((MAX_VERTICES, 2)))
+    np.testing.assert_array_equal(vertices[1], np.full((MAX_VERTICES, 2), [5, 7]))
+    np.testing.assert_array_equal(vertices[2, :2], [[5, 7], [9, 8]])
+
+
 def test_hulls_of_clusters_are_those_of_opencv(cases):
     for case in cases:
         points, count = parity.padded_points([case])
