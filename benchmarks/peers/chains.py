@@ -209,7 +209,8 @@ def sklearn_chain() -> Chain:
         ransac = RANSACRegressor(
             LinearRegression(), residual_threshold=PLANE_TOLERANCE_M, max_trials=HYPOTHESES, random_state=0
         ).fit(low[:, :2], low[:, 2])
-        slope, offset = ransac.estimator_.coef_, ransac.estimator_.intercept_
+        line: Any = ransac.estimator_
+        slope, offset = line.coef_, line.intercept_
         kept = above_plane(xyz, np.array([-slope[0], -slope[1], 1.0, -offset]))
         kept = kept[kept[:, 2] < MAX_HEIGHT_M - SENSOR_HEIGHT_M]
         dbscan = DBSCAN(eps=LINK_M, min_samples=3)
