@@ -70,7 +70,10 @@ def read_las(path: str | os.PathLike[str]) -> Points:
     except InputError:
         raise
     # laspy and its decoders raise whatever the bytes lead them to; lazrs even its own Rust errors.
-    except Exception as error:
+    except BaseException as error:
+        # A panic in Rust is no Exception.
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
         raise InputError(f"{path}: no readable LAS or LAZ file ({reason(error)}); copy it again.") from error
     _check_frame(columns, str(path))
     return named_points(columns, str(path))
