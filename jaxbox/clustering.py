@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import WORD_BITS, lookup, prefix_sum, store, take
+from jaxbox.masked import WORD_BITS, compact, lookup, prefix_sum, store, take
 from jaxbox.types import Clusters
 
 STRIP_WORDS = 32
@@ -27,6 +27,9 @@ MAX_STARTS = WORD_BITS // 2
 
 NONE = 0
 """Cell, run and component of points that have none; the others count from 1."""
+
+LINK_CHUNK = 4096
+"""Links between runs that are followed at a time; a sweep of 64 beams has some 1,000 to 14,000."""
 
 NUM_BOUNDS = 8
 """Columns of the table of bounds, of which six are used: rows of 8 scatter twice as fast as rows of 6."""
@@ -308,14 +311,25 @@ def _by_map(row: CellRow, cell: jax.Array) -> list[jax.Array]:
 
 def _connect(parent: jax.Array, links: list[jax.Array]) -> jax.Array:
     """(C,) int32: the lowest node of each node's component."""
-    ends = jnp.stack(links)
+    num_nodes = parent.shape[0]
+    links = store(links, parent[NONE] >= 0)
+    ends = jnp.concatenate(links)
+    # Few nodes have a link of every kind: those that there are make a list.
+    listed, num = compact(ends != jnp.tile(jnp.arange(num_nodes), len(links)), ends.shape[0])
+    num_chunks = (num + LINK_CHUNK - 1) // LINK_CHUNK
+    listed = jnp.pad(listed, (0, -listed.shape[0] % LINK_CHUNK), constant_values=ends.shape[0])
+
+    def hook_chunk(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        root, moved = state
+        link = jax.lax.dynamic_slice_in_dim(listed, i * LINK_CHUNK, LINK_CHUNK)
+        # Beyond the last link stands the node of no cell, and its end.
+        pair = lookup(root, link % num_nodes), lookup(root, take(ends, link, NONE))
+        low, high = jnp.minimum(*pair), jnp.maximum(*pair)
+        return root.at[high].min(low), moved | jnp.any(low < high)
 
     def hook(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        root, _ = state
-        other = lookup(root, ends)
-        low, high = jnp.minimum(root, other), jnp.maximum(root, other)
-        hooked = _jump(root.at[high].min(low))
-        return hooked, jnp.any(low < high)
+        root, moved = jax.lax.fori_loop(0, num_chunks, hook_chunk, (state[0], jnp.bool_(False)))
+        return _jump(root), moved
 
     return jax.lax.while_loop(lambda state: state[1], hook, (_jump(parent), jnp.bool_(True)))[0]
 

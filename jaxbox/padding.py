@@ -26,17 +26,17 @@ def fitting_capacity(num_points: int) -> int:
     return next((bucket for bucket in CAPACITY_BUCKETS if bucket >= num_points), CAPACITY_BUCKETS[-1])
 
 
-def aligned_zeros(shape: tuple[int, ...]) -> np.ndarray:
-    """Zeros that JAX can use without a copy.
+def aligned_empty(shape: tuple[int, ...]) -> np.ndarray:
+    """Room for an array that JAX can use without a copy.
 
     Args:
       shape: any.
 
     Returns:
-      float32 zeros whose memory starts at a multiple of what XLA wants of its buffers.
+      float32, anything, in memory that starts at a multiple of what XLA wants of its buffers.
     """
     num_bytes = math.prod(shape) * np.dtype(np.float32).itemsize
-    memory = np.zeros(num_bytes + ALIGNMENT_BYTES, np.uint8)
+    memory = np.empty(num_bytes + ALIGNMENT_BYTES, np.uint8)
     start = -memory.ctypes.data % ALIGNMENT_BYTES
     return memory[start : start + num_bytes].view(np.float32).reshape(shape)
 

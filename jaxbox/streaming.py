@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxbox.config import DetectorConfig
 from jaxbox.detector import detect
-from jaxbox.padding import aligned_zeros, checked_points, fill_rows, fitting_capacity
+from jaxbox.padding import aligned_empty, checked_points, fill_rows, fitting_capacity
 from jaxbox.steps import check_settings
 from jaxbox.types import Detections, PointCloud
 from jaxbox.workers import ProcessPool, WorkerDied, ahead
@@ -93,19 +93,18 @@ class _Buffer:
     """Padded arrays that sweeps of one capacity after the other are written to."""
 
     def __init__(self) -> None:
-        self._rows, self._intensity = aligned_zeros((0, 4)), aligned_zeros((0,))
+        self._rows, self._intensity = aligned_empty((0, 4)), aligned_empty((0,))
 
     def fill(self, xyz: np.ndarray, intensity: np.ndarray | None, capacity: int | None) -> PointCloud:
         """A cloud that holds until the buffer is filled again."""
         xyz, intensity = checked_points(xyz, intensity)
         capacity = fitting_capacity(len(xyz)) if capacity is None else capacity
         if len(self._rows) != capacity:
-            self._rows, self._intensity = aligned_zeros((capacity, 4)), aligned_zeros((capacity,))
+            self._rows, self._intensity = aligned_empty((capacity, 4)), aligned_empty((capacity,))
         fill_rows(xyz, intensity, self._rows, self._intensity)
         # On a CPU the cloud's arrays are the buffer: who fills it again has waited for the result.
-        rows = jax.device_put(self._rows, may_alias=True)
-        padded = jax.device_put(self._intensity, may_alias=True)
-        return PointCloud(rows, padded, jnp.int32(len(xyz)))
+        arrays = self._rows, self._intensity, np.int32(len(xyz))
+        return PointCloud(*jax.device_put(arrays, may_alias=True))
 
 
 def _read(sweep: ReadableSweep, buffer: _Buffer, capacity: int | None) -> PointCloud | str:

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox.padding import aligned_zeros, checked_points, fill_rows, fitting_capacity
+from jaxbox.padding import aligned_empty, checked_points, fill_rows, fitting_capacity
 
 if TYPE_CHECKING:
     from jaxbox.config import DetectorConfig
@@ -132,10 +132,10 @@ class PointCloud:
         capacity = fitting_capacity(len(xyz)) if capacity is None else capacity
         if capacity < 1:
             raise ValueError(f"capacity is {capacity}; it must be at least 1.")
-        rows, padded = aligned_zeros((capacity, 4)), aligned_zeros((capacity,))
+        rows, padded = aligned_empty((capacity, 4)), aligned_empty((capacity,))
         fill_rows(xyz, intensity, rows, padded)
         # Nobody else holds these arrays, so JAX may use them as they are.
-        return cls(jax.device_put(rows), jax.device_put(padded), jnp.int32(len(xyz)))
+        return cls(*jax.device_put((rows, padded, np.int32(len(xyz)))))
 
 
 def stack_clouds(clouds: Sequence[PointCloud]) -> PointCloud:

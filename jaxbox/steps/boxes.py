@@ -69,14 +69,10 @@ def _hull_points(
     obstacles: Obstacles, proposals: Proposals, config: DetectorConfig
 ) -> tuple[box.PointLists, jax.Array]:
     """The hull of each cluster, as the points that its rectangle is fitted to (the paper)."""
-    num_maps, num_obstacles = proposals.cluster.shape
+    num_clusters = proposals.num_points.shape[0]
+    cluster, row, num = _list_points(proposals, proposals.cluster < num_clusters, proposals.cluster.size)
     index = hull.extreme_points(
-        proposals.cluster.reshape(-1),
-        jnp.tile(jnp.arange(num_obstacles), num_maps),
-        jnp.int32(proposals.cluster.size),
-        obstacles.xy,
-        num_clusters=proposals.num_points.shape[0],
-        num_slices=config.hull.num_slices,
+        cluster, row, num, obstacles.xy, num_clusters=num_clusters, num_slices=config.hull.num_slices
     )
     trace = functools.partial(trace_hulls, obstacles.xy, max_vertices=config.hull.max_vertices)
     vertices, count = map_rows(trace, index, num_rows=proposals.num_clusters, chunk=HULL_CHUNK)
@@ -95,21 +91,35 @@ def _slab_points(
     obstacles: Obstacles, proposals: Proposals, config: DetectorConfig
 ) -> tuple[box.PointLists, jax.Array]:
     """The points of each cluster between the slab's heights, or all where those are few."""
-    num_maps, num_obstacles = proposals.cluster.shape
-    num_clusters = proposals.num_points.shape[0]
-    # The points of all maps in one list, without gaps.
-    entry, num = compact(proposals.fitted.reshape(-1), num_maps * max_slab_points(obstacles.num_rows, config))
-    # The remainder by the number of obstacles, without the division.
-    row = entry - num_obstacles * sum(entry >= num_obstacles * i for i in range(1, num_maps))
+    num_maps = proposals.cluster.shape[0]
+    capacity = num_maps * max_slab_points(obstacles.num_rows, config)
+    cluster, row, num = _list_points(proposals, proposals.fitted, capacity)
     lists = box.list_points(
-        jnp.take(proposals.cluster.reshape(-1), entry, mode="clip"),
+        cluster,
         row,
         num,
         obstacles.xy,
-        num_clusters=num_clusters,
+        num_clusters=proposals.num_points.shape[0],
         max_points=config.box.max_points,
     )
     return lists, jnp.int32(0)
+
+
+def _list_points(
+    proposals: Proposals, listed: jax.Array, capacity: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The points (maps, O) of all maps that are to be listed, in one list without gaps.
+
+    Returns:
+      cluster: (capacity,) int32.
+      row: (capacity,) int32 of the obstacle.
+      num: () int32; only the first so many count.
+    """
+    num_maps, num_obstacles = proposals.cluster.shape
+    entry, num = compact(listed.reshape(-1), capacity)
+    # The remainder by the number of obstacles, without the division.
+    row = entry - num_obstacles * sum(entry >= num_obstacles * i for i in range(1, num_maps))
+    return jnp.take(proposals.cluster.reshape(-1), entry, mode="clip"), row, num
 
 
 def max_slab_points(capacity: int, config: DetectorConfig) -> int:
