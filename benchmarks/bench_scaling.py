@@ -5,8 +5,9 @@
 Sweeps of 16,384 to 1,048,576 points are real ones: thinned out, or several turned about the sensor and laid
 over each other, which no scene is, so some capacities overflow (status). A batch is a loop over `detect`, a
 `detect_batch`, and a `jax.vmap`, whose bits are compared with the singles'. Throughput is measured in
-processes of their own: one that may use one core, one that may use all, two devices in one process, and
-`jaxbox.stream` over as many processes as there are cores.
+processes of their own: `detect_batch` of sweeps in memory, by a process that may use one core, all cores,
+or a device a core; and `jaxbox.stream`, which reads the files too, with one core, all cores or a worker a
+core.
 """
 
 import argparse
@@ -36,6 +37,8 @@ QUICK_CAPACITIES = (2**14, 2**17)
 RUNS, QUICK_RUNS = 20, 5
 STREAMED, QUICK_STREAMED = 160, 24
 """Sweeps of a measurement of throughput."""
+ROUNDS = 5
+"""Measurements of throughput of each kind."""
 TURN_DEG = 17.3
 """Between sweeps that are laid over each other."""
 
@@ -112,11 +115,14 @@ def repeated(sweeps: Sequence[Sweep], count: int) -> Iterator[Sweep]:
     return itertools.islice(itertools.cycle(sweeps), count)
 
 
-def rate_in_process(sweeps: Sequence[Sweep], preset: str, count: int, cores: int, devices: int) -> float:
-    """Sweeps a second of `detect_batch` in this process, which becomes one of so many cores and devices."""
-    if cores:
-        os.sched_setaffinity(0, set(itertools.islice(sorted(os.sched_getaffinity(0)), cores)))
-    common.enable_cache()
+def hold_to(cores: int) -> None:
+    """Lets this process use no more than so many cores; JAX asks how many there are when it starts."""
+    os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:cores]))
+
+
+def rate_of_batch(sweeps: Sequence[Sweep], preset: str, count: int, cores: int, devices: int) -> float:
+    """Sweeps a second of `detect_batch`, from arrays on the device, with so many cores and devices."""
+    hold_to(cores)
     if devices > 1:
         jax.config.update("jax_num_cpu_devices", devices)
     config = DetectorConfig.presets()[preset]
@@ -129,8 +135,9 @@ def rate_in_process(sweeps: Sequence[Sweep], preset: str, count: int, cores: int
     return count / (time.perf_counter() - start)
 
 
-def rate_of_stream(sweeps: Sequence[Sweep], preset: str, count: int, workers: int) -> float:
+def rate_of_stream(sweeps: Sequence[Sweep], preset: str, count: int, cores: int, workers: int) -> float:
     """Sweeps a second of `jaxbox.stream`, from files to boxes, once all workers are at work."""
+    hold_to(cores)
     start_up = 4 * workers
     results = jaxbox.stream(
         repeated(sweeps, start_up + count), DetectorConfig.presets()[preset], workers=workers
@@ -144,23 +151,34 @@ def rate_of_stream(sweeps: Sequence[Sweep], preset: str, count: int, workers: in
     return count / (time.perf_counter() - start)
 
 
-def throughput(sweeps: Sequence[Sweep], preset: str, count: int) -> dict[str, float]:
-    """Sweeps a second, by what works at them."""
+def throughput(sweeps: Sequence[Sweep], preset: str, count: int, rounds: int) -> list[dict[str, Any]]:
+    """Sweeps a second by what works at them, and how many times that of the same work on one core.
+
+    A ratio is taken within a round, in which all take their turn, and the median of the rounds' is given.
+    """
     cores = len(os.sched_getaffinity(0))
-    ways: dict[str, tuple[Callable[..., float], tuple[int, ...]]] = {
-        "one process, one core": (rate_in_process, (1, 1)),
-        "one process, all cores": (rate_in_process, (0, 1)),
-        f"one process, {cores} devices": (rate_in_process, (0, cores)),
-        "stream, one worker": (rate_of_stream, (1,)),
-        f"stream, {cores} workers": (rate_of_stream, (cores,)),
+    ways = {
+        "detect_batch": {"one core": (1, 1), "all cores": (cores, 1), f"{cores} devices": (cores, cores)},
+        "stream": {"one core": (1, 1), "all cores": (cores, 1), f"{cores} workers": (cores, cores)},
     }
-    rates = {}
-    for name, (function, arguments) in ways.items():
-        # A process each: cores and devices cannot be changed once JAX runs.
-        spawn = multiprocessing.get_context("spawn")
-        with concurrent.futures.ProcessPoolExecutor(1, spawn) as pool:
-            rates[name] = pool.submit(_call, function, (sweeps, preset, count, *arguments)).result()
-    return rates
+    measure: dict[str, Callable[..., float]] = {"detect_batch": rate_of_batch, "stream": rate_of_stream}
+    rates: dict[tuple[str, str], list[float]] = {(call, on): [] for call in ways for on in ways[call]}
+    for _ in range(rounds):
+        for (call, on), measured in rates.items():
+            # A process each: cores and devices cannot be changed once JAX runs.
+            spawn = multiprocessing.get_context("spawn")
+            with concurrent.futures.ProcessPoolExecutor(1, spawn) as pool:
+                arguments = (sweeps, preset, count, *ways[call][on])
+                measured.append(pool.submit(_call, measure[call], arguments).result())
+    return [
+        {
+            "call": call,
+            "on": on,
+            "sweeps_per_s": float(np.median(rates[call, on])),
+            "times_one_core": float(np.median(np.divide(rates[call, on], rates[call, "one core"]))),
+        }
+        for call, on in rates
+    ]
 
 
 def _call(function: Callable[..., float], arguments: tuple[Any, ...]) -> float:
@@ -177,7 +195,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     config, quick = common.chosen_config(options), options.quick
     sweeps = common.kitti_sweeps(8)
     points = [sweep.read_points()[0] for sweep in sweeps]
-    rates = throughput(sweeps, options.preset, QUICK_STREAMED if quick else STREAMED)
+    rates = (
+        throughput(sweeps, options.preset, QUICK_STREAMED, 1)
+        if quick
+        else throughput(sweeps, options.preset, STREAMED, ROUNDS)
+    )
     sizes = time_sizes(
         points, QUICK_CAPACITIES if quick else CAPACITY_BUCKETS, config, QUICK_RUNS if quick else RUNS
     )
@@ -190,10 +212,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     names = ("loop", "detect_batch", "vmap", "vmap_same_bits")
     common.print_table(["batch", *names], [[r["batch"], *(r.get(n) for n in names)] for r in batches])
     print()
-    base = rates["one process, one core"]
-    rows = [(name, rate, rate / base) for name, rate in rates.items()]
-    common.print_table(["", "sweeps a second", "times one core"], rows)
-    common.write_report({"sizes": sizes, "batches": batches, "sweeps_per_s": rates}, options)
+    columns = ("call", "on", "sweeps_per_s", "times_one_core")
+    common.print_table(
+        ["", "on", "sweeps a second", "times one core"], [[row[c] for c in columns] for row in rates]
+    )
+    common.write_report({"sizes": sizes, "batches": batches, "throughput": rates}, options)
 
 
 if __name__ == "__main__":

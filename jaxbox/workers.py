@@ -28,6 +28,9 @@ THREADS_VARIABLE = "NPROC"
 _END_S = 10.0
 """An idle process that has not ended by itself after so long is killed."""
 
+_LARGE_BYTES = 4096
+"""Arrays of this size and more go from process to process as they are; smaller ones within the pickle."""
+
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 Begun = TypeVar("Begun")
@@ -195,11 +198,11 @@ class _Process:
         data = pickle.dumps(item)
         try:
             self._connection.send_bytes(data)
-            answer = self._connection.recv_bytes()
+            head, *arrays = [self._connection.recv_bytes() for _ in range(self._connection.recv())]
         except (EOFError, OSError) as error:
             self._process.join(_END_S)
             raise _ProcessEnded(_describe_exit(self._process.exitcode)) from error
-        is_result, value = pickle.loads(answer)
+        is_result, value = pickle.loads(head, buffers=[bytearray(array) for array in arrays])
         if not is_result:
             raise value
         return value
@@ -241,15 +244,18 @@ def _serve(connection: Connection, surroundings: _Surroundings, start: _Start) -
             data = connection.recv_bytes()
         except EOFError:
             return
-        connection.send_bytes(_answer(start, calls, data))
+        parts = _answer(start, calls, data)
+        connection.send(len(parts))
+        for part in parts:
+            connection.send_bytes(part)
 
 
-def _answer(start: _Start, calls: list[Callable[[Any], Any]], data: bytes) -> bytes:
-    """(True, result) or (False, error), pickled."""
+def _answer(start: _Start, calls: list[Callable[[Any], Any]], data: bytes) -> list[bytes | memoryview]:
+    """(True, result) or (False, error), see `_pickle`."""
     try:
         if not calls:
             calls.append(start())
-        return pickle.dumps((True, calls[0](pickle.loads(data))))
+        return _pickle((True, calls[0](pickle.loads(data))))
     except Exception as error:
         error.add_note(f"In a worker process:\n{traceback.format_exc()}")
         try:
@@ -257,5 +263,19 @@ def _answer(start: _Start, calls: list[Callable[[Any], Any]], data: bytes) -> by
             pickle.loads(sent)
         except Exception:
             # An error that cannot travel goes as its words.
-            return pickle.dumps((False, RuntimeError(f"{type(error).__name__}: {error}")))
-        return sent
+            return [pickle.dumps((False, RuntimeError(f"{type(error).__name__}: {error}")))]
+        return [sent]
+
+
+def _pickle(value: Any) -> list[bytes | memoryview]:
+    """A value pickled, and after it the memory of its large arrays, which is not copied."""
+    arrays: list[memoryview] = []
+
+    def keep_inside(buffer: pickle.PickleBuffer) -> bool:
+        memory = buffer.raw()
+        is_small = memory.nbytes < _LARGE_BYTES
+        if not is_small:
+            arrays.append(memory)
+        return is_small
+
+    return [pickle.dumps(value, protocol=5, buffer_callback=keep_inside), *arrays]

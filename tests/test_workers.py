@@ -7,6 +7,7 @@ import pathlib
 import signal
 import time
 
+import numpy as np
 import pytest
 
 from jaxbox import workers
@@ -44,6 +45,26 @@ def start(marks):
     return functools.partial(work, marks)
 
 
+def make_arrays(seed):
+    """Arrays of every kind of memory, large ones and small."""
+    large = np.random.default_rng(seed).normal(size=(300, 200))
+    fixed = large.astype(np.float32)
+    fixed.flags.writeable = False
+    return {
+        "rows": large,
+        "columns": np.asfortranarray(large),
+        "every other": large[::2, ::3],
+        "small": large[:2, :2].copy(),
+        "empty": np.zeros((0, 3)),
+        "flags": large > 0,
+        "fixed": fixed,
+    }
+
+
+def start_making_arrays():
+    return make_arrays
+
+
 def outcome(future):
     try:
         return future.result()
@@ -72,6 +93,16 @@ def test_every_item_gets_its_answer_whatever_happens_to_the_others(tmp_path):
     }
     assert len({answer[1] for answer in answers if isinstance(answer, tuple)}) > 1, "they share the work"
     assert multiprocessing.active_children() == []
+
+
+def test_arrays_arrive_as_they_were_sent():
+    with ProcessPool(start_making_arrays, 1) as pool:
+        answers = [pool.submit(seed).result() for seed in range(3)]
+    for seed, arrays in enumerate(answers):
+        for name, expected in make_arrays(seed).items():
+            np.testing.assert_array_equal(arrays[name], expected, err_msg=name)
+            assert arrays[name].dtype == expected.dtype
+            assert arrays[name].flags.writeable == expected.flags.writeable, name
 
 
 def test_leaving_early_ends_the_processes_at_once(tmp_path, monkeypatch):

@@ -28,7 +28,7 @@ def read_nuscenes(path: str | os.PathLike[str]) -> Points:
       InputError: where it is missing, or its size is no multiple of 20 bytes.
     """
     points = read_float_rows(path, _COLUMNS, "x, y, z, intensity, ring")
-    return points[:, :3].copy(), points[:, 3].copy()
+    return points[:, :3], points[:, 3]
 
 
 def nuscenes_timestamp_ns(path: pathlib.Path) -> int | None:

@@ -208,7 +208,7 @@ def read_bin(path: str | os.PathLike[str]) -> Points:
       InputError: where the file is missing, or its size is no multiple of 16 bytes.
     """
     points = read_float_rows(path, _VALUES_PER_POINT, "x, y, z, intensity")
-    return points[:, :3].copy(), points[:, 3].copy()
+    return points[:, :3], points[:, 3]
 
 
 def read_float_rows(path: str | os.PathLike[str], columns: int, names: str) -> np.ndarray:
