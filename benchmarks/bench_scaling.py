@@ -115,16 +115,15 @@ def repeated(sweeps: Sequence[Sweep], count: int) -> Iterator[Sweep]:
     return itertools.islice(itertools.cycle(sweeps), count)
 
 
-def hold_to(cores: int) -> None:
-    """Lets this process use no more than so many cores; JAX asks how many there are when it starts."""
+def use(cores: int, devices: int) -> None:
+    """Holds this process to so many cores and devices, which JAX asks for when it starts."""
     os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:cores]))
+    jax.config.update("jax_num_cpu_devices", devices)
 
 
 def rate_of_batch(sweeps: Sequence[Sweep], preset: str, count: int, cores: int, devices: int) -> float:
     """Sweeps a second of `detect_batch`, from arrays on the device, with so many cores and devices."""
-    hold_to(cores)
-    if devices > 1:
-        jax.config.update("jax_num_cpu_devices", devices)
+    use(cores, devices)
     config = DetectorConfig.presets()[preset]
     clouds = [PointCloud.from_numpy(*sweep.read_points()) for sweep in sweeps]
     placed = [jax.device_put(c, device) for c, device in zip(clouds, itertools.cycle(jax.local_devices()))]
@@ -135,10 +134,12 @@ def rate_of_batch(sweeps: Sequence[Sweep], preset: str, count: int, cores: int, 
     return count / (time.perf_counter() - start)
 
 
-def rate_of_stream(sweeps: Sequence[Sweep], preset: str, count: int, cores: int, workers: int) -> float:
-    """Sweeps a second of `jaxbox.stream`, from files to boxes, once all workers are at work."""
-    hold_to(cores)
-    start_up = 4 * workers
+def rate_of_stream(
+    sweeps: Sequence[Sweep], preset: str, count: int, cores: int, devices: int, workers: int
+) -> float:
+    """Sweeps a second of `jaxbox.stream`, from files to boxes, once all devices or workers are at work."""
+    use(cores, devices)
+    start_up = 4 * workers * devices
     results = jaxbox.stream(
         repeated(sweeps, start_up + count), DetectorConfig.presets()[preset], workers=workers
     )
@@ -157,9 +158,14 @@ def throughput(sweeps: Sequence[Sweep], preset: str, count: int, rounds: int) ->
     A ratio is taken within a round, in which all take their turn, and the median of the rounds' is given.
     """
     cores = len(os.sched_getaffinity(0))
-    ways = {
+    ways: dict[str, dict[str, tuple[int, ...]]] = {
         "detect_batch": {"one core": (1, 1), "all cores": (cores, 1), f"{cores} devices": (cores, cores)},
-        "stream": {"one core": (1, 1), "all cores": (cores, 1), f"{cores} workers": (cores, cores)},
+        "stream": {
+            "one core": (1, 1, 1),
+            "all cores": (cores, 1, 1),
+            f"{cores} devices": (cores, cores, 1),
+            f"{cores} workers": (cores, 1, cores),
+        },
     }
     measure: dict[str, Callable[..., float]] = {"detect_batch": rate_of_batch, "stream": rate_of_stream}
     rates: dict[tuple[str, str], list[float]] = {(call, on): [] for call in ways for on in ways[call]}

@@ -39,16 +39,43 @@ def detect_batch(
     Raises:
       ValueError: for no devices, or settings that contradict each other.
     """
+    devices = checked_devices(devices)
+    turns = itertools.islice(itertools.cycle(devices), len(clouds))
+    return [detect_on(device, cloud, config, key) for device, cloud in zip(turns, clouds, strict=True)]
+
+
+def checked_devices(devices: Sequence[Any] | None) -> Sequence[Any]:
+    """The devices to compute on: all of this process where none are named.
+
+    Args:
+      devices: JAX devices, or None.
+
+    Returns:
+      At least one.
+
+    Raises:
+      ValueError: for no devices.
+    """
     devices = jax.local_devices() if devices is None else devices
     if not devices:
         raise ValueError("devices is empty; name at least one, or leave it out for all of this process.")
-    turns = itertools.islice(itertools.cycle(devices), len(clouds))
-    return [_detect_on(device, cloud, config, key) for device, cloud in zip(turns, clouds, strict=True)]
+    return devices
 
 
-def _detect_on(
+def detect_on(
     device: Any, cloud: PointCloud, config: DetectorConfig | None, key: jax.Array | None
 ) -> Detections:
+    """`detect` on a device, to which the cloud is sent where it is not there.
+
+    Args:
+      device: a JAX device.
+      cloud: as `detect` takes it.
+      config: as `detect` takes it.
+      key: as `detect` takes it.
+
+    Returns:
+      The detections, which may still be computing.
+    """
     # An array that was put on a device is tied to it, and JAX compiles anew for it even where it already was.
     if device not in cloud.xyz1.devices():
         cloud, key = jax.device_put((cloud, key), device)

@@ -3,22 +3,22 @@
 import concurrent.futures
 import dataclasses
 import itertools
-from collections.abc import Callable, Iterable, Iterator
-from typing import Protocol
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbox.batching import checked_devices, detect_on
 from jaxbox.config import DetectorConfig
-from jaxbox.detector import detect
 from jaxbox.padding import aligned_empty, checked_points, fill_rows, fitting_capacity
 from jaxbox.steps import check_settings
 from jaxbox.types import Detections, PointCloud
 from jaxbox.workers import ProcessPool, WorkerDied, ahead
 
 NUM_BUFFERS = 3
-"""One sweep is computed, one has been read, and one is being read."""
+"""Of each device: one sweep is computed, one has been read, and one is being read."""
 
 
 class ReadableSweep(Protocol):
@@ -55,13 +55,15 @@ def stream(
     *,
     capacity: int | None = None,
     workers: int = 1,
+    devices: Sequence[Any] | None = None,
 ) -> Iterator[StreamedSweep]:
     """Finds the vehicles of recorded sweeps, and reads ahead meanwhile.
 
-    With one worker a thread reads and pads the next sweep while one is computed, into buffers that are used
-    again. With more, each sweep is read, padded and computed by one of so many processes, which scales
-    better than threads; each compiles, or takes the program from JAX's compilation cache where that is
-    on, and a script must start its work under ``if __name__ == "__main__":``.
+    With one worker a thread reads and pads the next sweeps while some are computed, into buffers that are
+    used again, and the devices take turns, see `detect_batch`: to use all cores of a CPU, ask for several
+    devices. With more workers, each sweep is read, padded and computed by one of so many processes, which
+    a script must start under ``if __name__ == "__main__":``. Each device and each process compiles, or takes
+    the program from JAX's compilation cache where that is on.
 
     It asks for sweeps before their turn: a sensor's, which come one by one, are for `detect`.
 
@@ -71,6 +73,8 @@ def stream(
       key: the JAX random key of all; None for `jax.random.key(0)`.
       capacity: points that every sweep is padded to; None for the bucket that holds it.
       workers: processes; with 1 it is this one.
+      devices: JAX devices of this process to compute on; None for all of them. Of no use with several
+        workers, each of which computes on its own first device.
 
     Yields:
       The result of each sweep, in their order, with the same bits as `detect` gives. One that cannot be
@@ -78,14 +82,17 @@ def stream(
       comes with an error where that dies too.
 
     Raises:
-      ValueError: for settings that contradict each other or workers below 1.
+      ValueError: for settings that contradict each other, workers below 1, no devices, or devices together
+        with several workers.
     """
     if workers < 1:
         raise ValueError(f"workers is {workers}; it must be at least 1.")
     config = DetectorConfig() if config is None else config
     check_settings(config)
     if workers == 1:
-        return _stream_here(sweeps, config, key, capacity)
+        return _stream_here(sweeps, config, key, capacity, checked_devices(devices))
+    if devices is not None:
+        raise ValueError(f"workers is {workers} and devices are named; name one of the two.")
     return _stream_apart(sweeps, _Settings.pack(config, key, capacity), workers)
 
 
@@ -117,12 +124,12 @@ def _read(sweep: ReadableSweep, buffer: _Buffer, capacity: int | None) -> PointC
 
 
 def _start(
-    name: str, cloud: PointCloud | str, config: DetectorConfig, key: jax.Array | None
+    name: str, cloud: PointCloud | str, config: DetectorConfig, key: jax.Array | None, device: Any
 ) -> StreamedSweep:
     """A result whose arrays may still be computing."""
     if isinstance(cloud, str):
         return StreamedSweep(name, 0, None, cloud)
-    return StreamedSweep(name, int(cloud.num_points), detect(cloud, config, key), None)
+    return StreamedSweep(name, int(cloud.num_points), detect_on(device, cloud, config, key), None)
 
 
 def _finish(started: StreamedSweep) -> StreamedSweep:
@@ -130,14 +137,24 @@ def _finish(started: StreamedSweep) -> StreamedSweep:
 
 
 def _stream_here(
-    sweeps: Iterable[ReadableSweep], config: DetectorConfig, key: jax.Array | None, capacity: int | None
+    sweeps: Iterable[ReadableSweep],
+    config: DetectorConfig,
+    key: jax.Array | None,
+    capacity: int | None,
+    devices: Sequence[Any],
 ) -> Iterator[StreamedSweep]:
-    buffers = itertools.cycle([_Buffer() for _ in range(NUM_BUFFERS)])
+    buffers = itertools.cycle([_Buffer() for _ in range(NUM_BUFFERS * len(devices))])
+    turns = itertools.cycle(devices)
+
+    def start(pair: tuple[ReadableSweep, concurrent.futures.Future[PointCloud | str]]) -> StreamedSweep:
+        sweep, read = pair
+        return _start(sweep.name, read.result(), config, key, next(turns))
+
     with concurrent.futures.ThreadPoolExecutor(1) as reader:
-        read = ahead(sweeps, lambda sweep: reader.submit(_read, sweep, next(buffers), capacity), 1)
-        # The device is busy with the next one while the caller looks at this.
-        started = ahead(read, lambda pair: _start(pair[0].name, pair[1].result(), config, key), 1)
-        for _, computing in started:
+        count = len(devices)
+        read = ahead(sweeps, lambda sweep: reader.submit(_read, sweep, next(buffers), capacity), count)
+        # The devices are busy with the next ones while the caller looks at this.
+        for _, computing in ahead(read, start, count):
             yield _finish(computing)
 
 
@@ -161,11 +178,11 @@ class _Settings:
 
     def start(self) -> Callable[[ReadableSweep], StreamedSweep]:
         """In a worker process: what takes each sweep."""
-        buffer, key = _Buffer(), None
+        buffer, key, device = _Buffer(), None, jax.local_devices()[0]
         if self.key_data is not None:
             key = jax.random.wrap_key_data(jnp.asarray(self.key_data), impl=self.key_impl)
         return lambda sweep: _finish(
-            _start(sweep.name, _read(sweep, buffer, self.capacity), self.config, key)
+            _start(sweep.name, _read(sweep, buffer, self.capacity), self.config, key, device)
         )
 
 

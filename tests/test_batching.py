@@ -43,10 +43,15 @@ def cloud(seed):
     return PointCloud.from_numpy(street(seed).xyz, capacity=CAPACITY)
 
 
+def first_device():
+    """The one that the single calls have been compiled for."""
+    return jax.local_devices()[:1]
+
+
 def test_a_batch_has_the_bits_of_the_singles_in_their_order_and_compiles_nothing_more():
     found(0)
     compiled = detector.count_compilations()
-    batch = detect_batch([cloud(seed) for seed in SEEDS], devices=jax.local_devices()[:1])
+    batch = detect_batch([cloud(seed) for seed in SEEDS], devices=first_device())
     assert detector.count_compilations() == compiled
     for seed, detections in zip(SEEDS, batch, strict=True):
         assert_same_bits(jax.device_get(detections), found(seed))
@@ -54,7 +59,7 @@ def test_a_batch_has_the_bits_of_the_singles_in_their_order_and_compiles_nothing
 
 def test_a_batch_takes_a_key_and_settings_for_all():
     key, config = jax.random.key(5), jax.tree.map(lambda value: 1.1 * value, DetectorConfig())
-    (detections,) = detect_batch([cloud(0)], config, key, jax.local_devices()[:1])
+    (detections,) = detect_batch([cloud(0)], config, key, first_device())
     assert_same_bits(jax.device_get(detections), run(street(0).xyz, config=config, key=key))
 
 
@@ -78,7 +83,7 @@ def test_a_batch_of_nothing_is_nothing_and_one_without_devices_is_refused():
 def test_a_stream_has_the_bits_of_the_singles_and_compiles_nothing_more():
     found(0)
     compiled = detector.count_compilations()
-    streamed = list(jaxbox.stream(recorded() * 2, capacity=CAPACITY))
+    streamed = list(jaxbox.stream(recorded() * 2, capacity=CAPACITY, devices=first_device()))
     assert [result.name for result in streamed] == [f"street {seed}" for seed in SEEDS] * 2
     for seed, result in zip(SEEDS * 2, streamed, strict=True):
         assert result.num_points == len(street(seed).xyz)
@@ -86,9 +91,25 @@ def test_a_stream_has_the_bits_of_the_singles_and_compiles_nothing_more():
     assert detector.count_compilations() == compiled
 
 
+def test_a_stream_takes_the_devices_in_turns_and_keeps_the_order(monkeypatch):
+    used = []
+
+    def detect_on(device, cloud, config, key):
+        used.append(device)
+        return jaxbox.detect(cloud, config, key)
+
+    # Each device would compile once more; that clouds are sent to theirs is shown above.
+    monkeypatch.setattr(streaming, "detect_on", detect_on)
+    streamed = list(jaxbox.stream(recorded() * 3, capacity=CAPACITY))
+    assert used == (jax.local_devices() * 5)[:9]
+    for seed, result in zip(SEEDS * 3, streamed, strict=True):
+        assert_same_bits(result.detections, found(seed))
+
+
 def test_a_stream_reports_a_sweep_that_cannot_be_read_and_goes_on():
     wrong = Recorded("wrong", np.zeros((5, 2), np.float32))
-    results = list(jaxbox.stream([*recorded({1: "unreadable"}), wrong], capacity=CAPACITY))
+    sweeps = [*recorded({1: "unreadable"}), wrong]
+    results = list(jaxbox.stream(sweeps, capacity=CAPACITY, devices=first_device()))
     assert [result.name for result in results] == ["street 0", "unreadable", "street 1", "street 2", "wrong"]
     assert [result.detections is None for result in results] == [False, True, False, False, True]
     assert results[1].error == "OSError: the disk is gone"
@@ -104,7 +125,7 @@ def test_a_stream_reads_ahead_no_farther_than_its_buffers_and_can_be_left():
             asked.append(sweep.name)
             yield sweep
 
-    results = jaxbox.stream(source(), capacity=CAPACITY)
+    results = jaxbox.stream(source(), capacity=CAPACITY, devices=first_device())
     next(results)
     assert len(asked) <= streaming.NUM_BUFFERS
     results.close()
@@ -114,6 +135,10 @@ def test_a_stream_reads_ahead_no_farther_than_its_buffers_and_can_be_left():
 def test_a_stream_refuses_what_cannot_work_before_it_starts():
     with pytest.raises(ValueError, match="workers is 0"):
         jaxbox.stream([], workers=0)
+    with pytest.raises(ValueError, match="devices is empty"):
+        jaxbox.stream([], devices=[])
+    with pytest.raises(ValueError, match="workers is 2 and devices are named"):
+        jaxbox.stream([], workers=2, devices=first_device())
     with pytest.raises(ValueError, match=r"evidence\.enabled"):
         jaxbox.stream([], DetectorConfig(evidence=EvidenceConfig(enabled=False)))
 
