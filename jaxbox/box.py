@@ -9,11 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbox.grouping import sort_by_group
-from jaxbox.masked import fold_points, map_rows, store, take
+from jaxbox.masked import fold_points, fold_rows, map_rows, store, take
 from jaxbox.types import Rectangles
 
 CHUNK = 128
 """Clusters at a time: their extents at all rotations stay in the cache."""
+
+VOTE_CHUNK = 64
+"""Votes at a time: few boxes of a sweep vote."""
 
 VOTE_POINTS, VOTE_EXTENT_M = 150.0, 6.0
 """A vote for the scene direction counts min(points, 150) x min(extent, 6 m)."""
@@ -317,7 +320,14 @@ def scene_preference(
         difference = (bins - angle_deg[..., None] % 90 + 45) % 90 - 45
         return jnp.exp(-((difference / sigma_deg) ** 2))
 
+    def add(votes: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
+        yaw, power = rows
+        return votes + power @ closeness(jnp.rad2deg(yaw))
+
     power = jnp.minimum(num_points, VOTE_POINTS) * jnp.minimum(extent, VOTE_EXTENT_M)
-    votes = jnp.where(voting, power, 0) @ closeness(jnp.rad2deg(yaw))
+    last = jnp.max(jnp.where(voting, jnp.arange(1, voting.shape[0] + 1), 0), initial=0)
+    ballots = yaw, jnp.where(voting, power, 0)
+    votes = jnp.zeros(num_angles)
+    votes = fold_rows(add, votes, ballots, num_rows=last, chunk=VOTE_CHUNK, absent=(0.0, 0.0))
     direction = bins[jnp.argmax(votes)]
     return jnp.where(jnp.max(votes) > 0, weight * closeness(direction), 0)

@@ -38,7 +38,9 @@ def point_moments(
         return [t.at[slot].add(v, mode="drop") for t, v in zip(total, values, strict=True)]
 
     total = [jnp.zeros(size), jnp.zeros((size, 2)), jnp.zeros((size, 2)), jnp.zeros(size)]
-    total = fold_rows(add, total, (slot, row), num_rows=num_rows, chunk=POINT_CHUNK)
+    total = fold_rows(
+        add, total, (slot, row), num_rows=num_rows, chunk=POINT_CHUNK, absent=(size, xy.shape[0])
+    )
     return jnp.concatenate([t.reshape(size, -1) for t in total], axis=1)
 
 

@@ -47,7 +47,13 @@ def extreme_points(
     index_bits = row.shape[0].bit_length()
     # More bits than float32 holds would round the largest value up, out of the word.
     value_bits = min(WORD_BITS - index_bits, 24)
-    fold = functools.partial(fold_rows, rows=(slot, row), num_rows=num_rows, chunk=POINT_CHUNK)
+    fold = functools.partial(
+        fold_rows,
+        rows=(slot, row),
+        num_rows=num_rows,
+        chunk=POINT_CHUNK,
+        absent=(num_clusters, xy.shape[0]),
+    )
     # Low bounds are high ones of the points turned by half a turn.
     sign = jnp.array([[1.0], [-1.0]])
 

@@ -285,29 +285,42 @@ def map_rows(
 
 
 def fold_rows(
-    update: Callable[[Any, jax.Array, Any], Any], state: Any, rows: Any, *, num_rows: jax.Array, chunk: int
+    update: Callable[[Any, jax.Array, Any], Any],
+    state: Any,
+    rows: Any,
+    *,
+    num_rows: jax.Array,
+    chunk: int,
+    absent: Any,
 ) -> Any:
     """Folds rows into a state, chunk by chunk, and skips chunks beyond the rows that count.
 
     Args:
-      update: maps the state, the indices of the rows of a chunk, and those rows, a pytree of (chunk, ...)
-        arrays, to the next state. Rows of the last chunk may lie beyond `num_rows`, or be zero.
+      update: maps the state, the indices of the rows of a chunk, and those rows, a pytree of (chunk,)
+        arrays, to the next state.
       state: pytree of arrays.
-      rows: pytree of (P, ...) arrays.
+      rows: pytree of (P,) arrays.
       num_rows: () int32, how many rows count.
       chunk: static, rows at a time.
+      absent: pytree of numbers, what the last chunk holds beyond the rows that count: such that `update`
+        makes nothing of it.
 
     Returns:
       The state after the last chunk.
     """
     size = jax.tree.leaves(rows)[0].shape[0]
-    padded = jax.tree.map(lambda a: jnp.pad(a, [(0, -size % chunk)] + [(0, 0)] * (a.ndim - 1)), rows)
+    num_rows = jnp.minimum(num_rows, size)
+    padded = jax.tree.map(lambda a: jnp.pad(a, (0, -size % chunk)), rows)
 
     def step(i: jax.Array, state: Any) -> Any:
-        part = jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, i * chunk, chunk), padded)
-        return update(state, i * chunk + jnp.arange(chunk), part)
+        index = i * chunk + jnp.arange(chunk)
 
-    return jax.lax.fori_loop(0, (jnp.minimum(num_rows, size) + chunk - 1) // chunk, step, state)
+        def part(values: jax.Array, value: Any) -> jax.Array:
+            return jnp.where(index < num_rows, jax.lax.dynamic_slice_in_dim(values, i * chunk, chunk), value)
+
+        return update(state, index, jax.tree.map(part, padded, absent))
+
+    return jax.lax.fori_loop(0, (num_rows + chunk - 1) // chunk, step, state)
 
 
 def fold_points(

@@ -43,6 +43,8 @@ ALLOWED = {
     **dict.fromkeys(STAGES, FOUNDATION),
     **dict.fromkeys(WIRING, FOUNDATION | STAGES | WIRING),
     **dict.fromkeys(MANY, FOUNDATION | WIRING | {"workers"}),
+    # A stream hands sweeps to devices as a batch does.
+    "streaming": FOUNDATION | WIRING | {"workers", "batching"},
     "reference": {"version", "types", "class_priors", "config", "masked"},
     "synthetic": FOUNDATION | {"projection"},
     **dict.fromkeys(TOOLS, FOUNDATION | STAGES | WIRING | TOOLS),

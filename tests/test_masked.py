@@ -87,12 +87,13 @@ def test_count_true_counts_every_mask_also_where_all_are_true(size):
 def test_fold_rows_sees_each_row_once_and_no_chunk_beyond_those_that_count(num_rows):
     def add(state, index, rows):
         total, seen = state
-        return total + jnp.sum(jnp.where(index < num_rows, rows, 0)), seen + len(rows)
+        return total + jnp.sum(rows), seen.at[index].add(1)
 
-    start = jnp.int32(0), jnp.int32(0)
-    total, seen = masked.fold_rows(add, start, jnp.arange(20) + 1, num_rows=jnp.int32(num_rows), chunk=8)
+    start = jnp.int32(0), jnp.zeros(24, jnp.int32)
+    rows, count = jnp.arange(20) + 1, jnp.int32(num_rows)
+    total, seen = masked.fold_rows(add, start, rows, num_rows=count, chunk=8, absent=0)
     assert int(total) == num_rows * (num_rows + 1) // 2
-    assert int(seen) == -(-num_rows // 8) * 8
+    assert seen.tolist() == [1] * (-(-num_rows // 8) * 8) + [0] * (24 - -(-num_rows // 8) * 8)
 
 
 @pytest.mark.parametrize("chunk", [1, 4, 16])

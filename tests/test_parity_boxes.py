@@ -150,6 +150,24 @@ def test_extreme_points_lose_at_most_a_slice_of_the_hull(cases):
             parity.assert_within(np.append(far, 0) / bound, 1, "of the bound of a slice")
 
 
+def test_what_a_list_holds_beyond_its_end_joins_no_cluster():
+    rng = np.random.default_rng(0)
+    size, num = hull.POINT_CHUNK + 900, hull.POINT_CHUNK + 300
+    xy = jnp.asarray(rng.normal(size=(size, 2)), jnp.float32)
+    slot = jnp.asarray(rng.integers(0, parity.MAX_CLUSTERS, size))
+    row, origin = jnp.arange(size), jnp.zeros((parity.MAX_CLUSTERS, 2))
+    whole = 2 * hull.POINT_CHUNK - num
+    listed = (
+        jnp.pad(slot[:num], (0, whole), constant_values=parity.MAX_CLUSTERS),
+        jnp.pad(row[:num], (0, whole)),
+    )
+    expected = extreme_points(*listed, num, xy)
+    np.testing.assert_array_equal(extreme_points(slot, row, num, xy), expected)
+    expected = point_moments(*listed, num, xy, origin)
+    np.testing.assert_array_equal(point_moments(slot, row, num, xy, origin), expected)
+    assert expected[:, 0].sum() == num
+
+
 def fits_of(cases):
     points, count = parity.padded_points(cases)
     lists = parity.point_lists(parity.pad(points, MAX_FITS), parity.pad(count, MAX_FITS))

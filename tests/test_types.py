@@ -261,6 +261,22 @@ def test_capacities_enlarged_as_the_errors_ask_clear_every_bit(rounds):
     assert len(rounds) > 1
 
 
+def test_a_capacity_for_obstacles_that_suffices_changes_nothing(rounds):
+    config, _ = rounds[-1]
+    cloud = PointCloud.from_numpy(STREET[::6], capacity=2**14)
+
+    def found(max_obstacles):
+        clustering = dataclasses.replace(config.clustering, max_obstacles=max_obstacles)
+        return jax.device_get(detect(cloud, dataclasses.replace(config, clustering=clustering)))
+
+    # Points are gone through in chunks of 4,096: one capacity is a whole number of them.
+    odd, even = found(2500), found(8192)
+    assert odd.valid.any()
+    assert int(odd.counts.obstacles) < 2500
+    for ours, theirs in zip(jax.tree.leaves(odd), jax.tree.leaves(even), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
 def test_a_field_is_named_again_only_where_more_was_seen(rounds):
     for (_, before), (config, after) in itertools.pairwise(rounds):
         status = Status(int(after.status))

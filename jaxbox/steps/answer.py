@@ -52,6 +52,14 @@ def conclude(
         row = take(obstacles.row, index, obstacles.num_rows)
         return point_detection.at[row].set(jnp.where(owner < valid.shape[0], owner, -1), mode="drop")
 
+    point_detection = fold_rows(
+        claim,
+        nowhere,
+        (asked, owner),
+        num_rows=num_asked,
+        chunk=OWNER_CHUNK,
+        absent=(obstacles.row.shape[0], valid.shape[0]),
+    )
     return Detections(
         center=jnp.where(valid[:, None], center, 0),
         size=jnp.where(valid[:, None], size, 0),
@@ -65,7 +73,7 @@ def conclude(
         ground=heights.plane,
         ground_mask=sweep.inlier & (heights.height <= config.ground.min_height_m),
         point_component=nowhere.at[obstacles.row].set(proposals.component, mode="drop"),
-        point_detection=fold_rows(claim, nowhere, (asked, owner), num_rows=num_asked, chunk=OWNER_CHUNK),
+        point_detection=point_detection,
         status=_status(counts, sweep, heights, obstacles, proposals, config),
         counts=counts,
     )

@@ -59,10 +59,18 @@ def fit_rectangles(obstacles: Obstacles, proposals: Proposals, config: DetectorC
     return Fits(curve, extents, place, points, hull_vertices)
 
 
-def best_rectangles(fits: Fits, preference: jax.Array, insistence: float = 1.0) -> Rectangles:
+def best_rectangles(
+    fits: Fits, num_clusters: jax.Array, preference: jax.Array, insistence: float = 1.0
+) -> Rectangles:
     """The rectangle of each cluster at its best rotation, see `box.best_rectangles`."""
-    rectangles = box.best_rectangles(fits.curve, fits.extents, preference, insistence=insistence)
-    return jax.tree.map(lambda a: a[fits.place], rectangles)
+
+    def best(rotations: tuple[jax.Array, box.Extents]) -> Rectangles:
+        rectangles = box.best_rectangles(*rotations, preference, insistence=insistence)
+        return jax.tree.map(jnp.transpose, rectangles)
+
+    columns = fits.curve, fits.extents
+    rectangles = map_rows(best, columns, num_rows=num_clusters, chunk=PROPOSAL_CHUNK, axis=-1)
+    return jax.tree.map(lambda a: a.T[fits.place], rectangles)
 
 
 def _hull_points(
@@ -144,9 +152,9 @@ def complete_boxes(
     preference = jnp.zeros(config.box.num_angles)
     if config.box.scene_direction and seen is not None:
         preference = _scene_preference(fits, proposals, seen, config)
-    readings = [best_rectangles(fits, preference)]
+    readings = [best_rectangles(fits, proposals.num_clusters, preference)]
     if config.box.scene_direction and config.completion.along_scene:
-        readings.append(best_rectangles(fits, preference, INSISTENCE))
+        readings.append(best_rectangles(fits, proposals.num_clusters, preference, INSISTENCE))
     trials = list_trials(proposals, readings, config)
     return trials, complete_trials(trials, readings, fits.points, seen, config)
 
@@ -157,7 +165,8 @@ def _scene_preference(
     """The direction that the first map's boxes, fitted without a preference, vote for."""
     settings = config.box
     size = config.clustering.maps[0].max_clusters
-    rectangles = jax.tree.map(lambda a: a[:size], best_rectangles(fits, jnp.zeros(settings.num_angles)))
+    rectangles = best_rectangles(fits, proposals.num_clusters, jnp.zeros(settings.num_angles))
+    rectangles = jax.tree.map(lambda a: a[:size], rectangles)
     long = longest_side(rectangles) >= settings.direction_min_extent_m
     cluster, num = compact(long & (jnp.arange(size) < proposals.num_first), size)
     voters = jax.tree.map(lambda a: take(a, cluster), rectangles)
