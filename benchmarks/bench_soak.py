@@ -11,6 +11,7 @@ frames, and two buckets.
 import argparse
 import concurrent.futures
 import dataclasses
+import functools
 import itertools
 import multiprocessing
 import pathlib
@@ -103,12 +104,16 @@ def soak(
 ) -> dict[str, Any]:
     """Streams sweeps, after some that compile whatever there is to compile."""
     counter = CompileCounter()
-    for result in jaxbox.stream([*warm_up] * 2, config, capacity=capacity):
+    # One device, so that the time between two results is that of one sweep.
+    stream = functools.partial(
+        jaxbox.stream, config=config, capacity=capacity, devices=jax.local_devices()[:1]
+    )
+    for result in stream([*warm_up] * 2):
         _check(result)
     warm_compiles, programs = counter.count, detector.count_compilations()
     intervals, capacities, points, memory = [], [], [], []
     last = time.perf_counter()
-    for frame, result in enumerate(jaxbox.stream(sweeps, config, capacity=capacity)):
+    for frame, result in enumerate(stream(sweeps)):
         now = time.perf_counter()
         intervals.append(1e3 * (now - last))
         last = now
