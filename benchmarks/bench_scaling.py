@@ -6,8 +6,8 @@ Sweeps of 16,384 to 1,048,576 points are real ones: thinned out, or several turn
 over each other, which no scene is, so some capacities overflow (status). A batch is a loop over `detect`, a
 `detect_batch`, and a `jax.vmap`, whose bits are compared with the singles'. Throughput is measured in
 processes of their own: `detect_batch` of sweeps in memory, by a process that may use one core, all cores,
-or a device a core; and `jaxbox.stream`, which reads the files too, with one core, all cores or a worker a
-core.
+or a device a core; and `jaxbox.stream`, which reads the files too, with one core, all cores, and a device
+or a worker a core.
 """
 
 import argparse
@@ -39,6 +39,7 @@ STREAMED, QUICK_STREAMED = 160, 24
 """Sweeps of a measurement of throughput."""
 ROUNDS = 5
 """Measurements of throughput of each kind."""
+ONE_CORE = "one core"
 TURN_DEG = 17.3
 """Between sweeps that are laid over each other."""
 
@@ -158,32 +159,31 @@ def throughput(sweeps: Sequence[Sweep], preset: str, count: int, rounds: int) ->
     A ratio is taken within a round, in which all take their turn, and the median of the rounds' is given.
     """
     cores = len(os.sched_getaffinity(0))
-    ways: dict[str, dict[str, tuple[int, ...]]] = {
-        "detect_batch": {"one core": (1, 1), "all cores": (cores, 1), f"{cores} devices": (cores, cores)},
-        "stream": {
-            "one core": (1, 1, 1),
-            "all cores": (cores, 1, 1),
-            f"{cores} devices": (cores, cores, 1),
-            f"{cores} workers": (cores, 1, cores),
-        },
+    ways: dict[tuple[str, str], tuple[Callable[..., float], tuple[int, ...]]] = {
+        ("detect_batch", ONE_CORE): (rate_of_batch, (1, 1)),
+        ("detect_batch", "all cores"): (rate_of_batch, (cores, 1)),
+        ("detect_batch", f"{cores} devices"): (rate_of_batch, (cores, cores)),
+        ("stream", ONE_CORE): (rate_of_stream, (1, 1, 1)),
+        ("stream", "all cores"): (rate_of_stream, (cores, 1, 1)),
+        ("stream", f"{cores} devices"): (rate_of_stream, (cores, cores, 1)),
+        ("stream", f"{cores} workers"): (rate_of_stream, (cores, 1, cores)),
     }
-    measure: dict[str, Callable[..., float]] = {"detect_batch": rate_of_batch, "stream": rate_of_stream}
-    rates: dict[tuple[str, str], list[float]] = {(call, on): [] for call in ways for on in ways[call]}
+    rates: dict[tuple[str, str], list[float]] = {way: [] for way in ways}
     for _ in range(rounds):
-        for (call, on), measured in rates.items():
+        for way, (function, arguments) in ways.items():
             # A process each: cores and devices cannot be changed once JAX runs.
             spawn = multiprocessing.get_context("spawn")
             with concurrent.futures.ProcessPoolExecutor(1, spawn) as pool:
-                arguments = (sweeps, preset, count, *ways[call][on])
-                measured.append(pool.submit(_call, measure[call], arguments).result())
+                rate = pool.submit(_call, function, (sweeps, preset, count, *arguments)).result()
+            rates[way].append(rate)
     return [
         {
             "call": call,
             "on": on,
-            "sweeps_per_s": float(np.median(rates[call, on])),
-            "times_one_core": float(np.median(np.divide(rates[call, on], rates[call, "one core"]))),
+            "sweeps_per_s": float(np.median(measured)),
+            "times_one_core": float(np.median(np.divide(measured, rates[call, ONE_CORE]))),
         }
-        for call, on in rates
+        for (call, on), measured in rates.items()
     ]
 
 
@@ -201,11 +201,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     config, quick = common.chosen_config(options), options.quick
     sweeps = common.kitti_sweeps(8)
     points = [sweep.read_points()[0] for sweep in sweeps]
-    rates = (
-        throughput(sweeps, options.preset, QUICK_STREAMED, 1)
-        if quick
-        else throughput(sweeps, options.preset, STREAMED, ROUNDS)
-    )
+    count, rounds = (QUICK_STREAMED, 1) if quick else (STREAMED, ROUNDS)
+    rates = throughput(sweeps, options.preset, count, rounds)
     sizes = time_sizes(
         points, QUICK_CAPACITIES if quick else CAPACITY_BUCKETS, config, QUICK_RUNS if quick else RUNS
     )

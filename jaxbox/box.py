@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbox.grouping import sort_by_group
-from jaxbox.masked import fold_points, fold_rows, map_rows, store, take
+from jaxbox.masked import fold_points, fold_rows, map_rows, rows_in_use, store, take
 from jaxbox.types import Rectangles
 
 CHUNK = 128
@@ -325,9 +325,8 @@ def scene_preference(
         return votes + power @ closeness(jnp.rad2deg(yaw))
 
     power = jnp.minimum(num_points, VOTE_POINTS) * jnp.minimum(extent, VOTE_EXTENT_M)
-    last = jnp.max(jnp.where(voting, jnp.arange(1, voting.shape[0] + 1), 0), initial=0)
     ballots = yaw, jnp.where(voting, power, 0)
     votes = jnp.zeros(num_angles)
-    votes = fold_rows(add, votes, ballots, num_rows=last, chunk=VOTE_CHUNK, absent=(0.0, 0.0))
+    votes = fold_rows(add, votes, ballots, num_rows=rows_in_use(voting), chunk=VOTE_CHUNK, absent=(0.0, 0.0))
     direction = bins[jnp.argmax(votes)]
     return jnp.where(jnp.max(votes) > 0, weight * closeness(direction), 0)

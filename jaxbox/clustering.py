@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import WORD_BITS, compact, lookup, prefix_sum, store, take
+from jaxbox.masked import WORD_BITS, compact, fold_rows, lookup, prefix_sum, store, take
 from jaxbox.types import Clusters
 
 STRIP_WORDS = 32
@@ -316,19 +316,21 @@ def _connect(parent: jax.Array, links: list[jax.Array]) -> jax.Array:
     ends = jnp.concatenate(links)
     # Few nodes have a link of every kind: those that there are make a list.
     listed, num = compact(ends != jnp.tile(jnp.arange(num_nodes), len(links)), ends.shape[0])
-    num_chunks = (num + LINK_CHUNK - 1) // LINK_CHUNK
-    listed = jnp.pad(listed, (0, -listed.shape[0] % LINK_CHUNK), constant_values=ends.shape[0])
 
-    def hook_chunk(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def hook_chunk(
+        state: tuple[jax.Array, jax.Array], _: jax.Array, link: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
         root, moved = state
-        link = jax.lax.dynamic_slice_in_dim(listed, i * LINK_CHUNK, LINK_CHUNK)
         # Beyond the last link stands the node of no cell, and its end.
         pair = lookup(root, link % num_nodes), lookup(root, take(ends, link, NONE))
         low, high = jnp.minimum(*pair), jnp.maximum(*pair)
         return root.at[high].min(low), moved | jnp.any(low < high)
 
     def hook(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        root, moved = jax.lax.fori_loop(0, num_chunks, hook_chunk, (state[0], jnp.bool_(False)))
+        start = state[0], jnp.bool_(False)
+        root, moved = fold_rows(
+            hook_chunk, start, listed, num_rows=num, chunk=LINK_CHUNK, absent=ends.shape[0]
+        )
         return _jump(root), moved
 
     return jax.lax.while_loop(lambda state: state[1], hook, (_jump(parent), jnp.bool_(True)))[0]

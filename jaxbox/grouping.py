@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import WORD_BITS, prefix_sum, store
+from jaxbox.masked import WORD_BITS, prefix_sum, rows_in_use, store
 
 SORT_STEPS = 4
 """Sorts are as long as what is there, in so many steps."""
@@ -126,7 +126,7 @@ def _sort_present(words: jax.Array, present: jax.Array) -> jax.Array:
     """Sorts words of which the absent ones are largest and in order: those past the last present one stay."""
     size = words.shape[0]
     step = -(-size // SORT_STEPS)
-    num = jnp.max(jnp.where(present, jnp.arange(1, size + 1), 0), initial=0)
+    num = rows_in_use(present)
 
     def sort_first(count: int, words: jax.Array) -> jax.Array:
         return jnp.concatenate([jax.lax.sort(words[:count], is_stable=False), words[count:]])

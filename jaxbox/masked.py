@@ -111,6 +111,21 @@ def _words(mask: jax.Array) -> jax.Array:
     return jnp.sum(jnp.where(bits, jnp.uint32(1) << bit, jnp.uint32(0)), axis=1, dtype=jnp.uint32)
 
 
+def rows_in_use(present: jax.Array) -> jax.Array:
+    """How many rows there are up to the last one that is present.
+
+    Args:
+      present: (N,) bool.
+
+    Returns:
+      () int32.
+
+    >>> int(rows_in_use(jnp.array([False, True, False])))
+    2
+    """
+    return jnp.max(jnp.where(present, jnp.arange(1, present.shape[0] + 1), 0), initial=0)
+
+
 def take(rows: jax.Array, index: jax.Array, fill: Any = 0) -> jax.Array:
     """Rows at the indices, and `fill` at the sentinel or any other index beyond.
 

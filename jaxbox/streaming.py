@@ -73,7 +73,7 @@ def stream(
       key: the JAX random key of all; None for `jax.random.key(0)`.
       capacity: points that every sweep is padded to; None for the bucket that holds it.
       workers: processes; with 1 it is this one.
-      devices: JAX devices of this process to compute on; None for all of them. Of no use with several
+      devices: JAX devices of this process to compute on; None for all of them, and with several
         workers, each of which computes on its own first device.
 
     Yields:

@@ -202,6 +202,7 @@ class _Process:
         except (EOFError, OSError) as error:
             self._process.join(_END_S)
             raise _ProcessEnded(_describe_exit(self._process.exitcode)) from error
+        # As bytes they could not be written to.
         is_result, value = pickle.loads(head, buffers=[bytearray(array) for array in arrays])
         if not is_result:
             raise value

@@ -281,7 +281,7 @@ def read_text_points(path: str | os.PathLike[str]) -> Points:
     # A number beyond float32's range becomes infinite, and is counted by the detector.
     with np.errstate(over="ignore"):
         points = points.astype(np.float32)
-    return points[:, :3].copy(), points[:, 3].copy()
+    return points[:, :3], points[:, 3]
 
 
 def _is_header(words: list[str]) -> bool:

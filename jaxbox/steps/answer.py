@@ -46,20 +46,6 @@ def conclude(
     counts = _counts(cloud, sweep, heights, obstacles, proposals, candidates, num, largest_hull, config)
 
     nowhere = jnp.full(sweep.xyz.shape[0], -1, jnp.int32)
-
-    def claim(point_detection: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
-        index, owner = rows
-        row = take(obstacles.row, index, obstacles.num_rows)
-        return point_detection.at[row].set(jnp.where(owner < valid.shape[0], owner, -1), mode="drop")
-
-    point_detection = fold_rows(
-        claim,
-        nowhere,
-        (asked, owner),
-        num_rows=num_asked,
-        chunk=OWNER_CHUNK,
-        absent=(obstacles.row.shape[0], valid.shape[0]),
-    )
     return Detections(
         center=jnp.where(valid[:, None], center, 0),
         size=jnp.where(valid[:, None], size, 0),
@@ -73,10 +59,29 @@ def conclude(
         ground=heights.plane,
         ground_mask=sweep.inlier & (heights.height <= config.ground.min_height_m),
         point_component=nowhere.at[obstacles.row].set(proposals.component, mode="drop"),
-        point_detection=point_detection,
+        point_detection=_claim_points(nowhere, asked, owner, num_asked, obstacles, valid.shape[0]),
         status=_status(counts, sweep, heights, obstacles, proposals, config),
         counts=counts,
     )
+
+
+def _claim_points(
+    nowhere: jax.Array,
+    asked: jax.Array,
+    owner: jax.Array,
+    num_asked: jax.Array,
+    obstacles: Obstacles,
+    num_detections: int,
+) -> jax.Array:
+    """(N,) int32: the detection of each point of the sweep, -1 for none, from those of `_owners`."""
+
+    def claim(of_point: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
+        index, owner = rows
+        row = take(obstacles.row, index, obstacles.num_rows)
+        return of_point.at[row].set(jnp.where(owner < num_detections, owner, -1), mode="drop")
+
+    absent = asked.shape[0], num_detections
+    return fold_rows(claim, nowhere, (asked, owner), num_rows=num_asked, chunk=OWNER_CHUNK, absent=absent)
 
 
 def _describe(
