@@ -12,7 +12,7 @@ from jaxbox.grouping import sort_by_group
 from jaxbox.masked import fold_points, fold_rows, map_rows, rows_in_use, store, take
 from jaxbox.types import Rectangles
 
-CHUNK = 128
+CHUNK = 64
 """Clusters at a time: their extents at all rotations stay in the cache."""
 
 VOTE_CHUNK = 64
@@ -23,9 +23,6 @@ VOTE_POINTS, VOTE_EXTENT_M = 150.0, 6.0
 
 FAR_M = 1e12
 """Farther away than any point."""
-
-Extents = tuple[jax.Array, jax.Array, jax.Array, jax.Array]
-"""Lower and upper bounds of u, then of v, each (A, C)."""
 
 PointTable = tuple[jax.Array, jax.Array, jax.Array]
 """x and y of points (M, C) m, and how many of them count (C,)."""
@@ -110,7 +107,7 @@ def try_rotations(
     criterion: str,
     num_angles: int,
     min_distance_m: jax.Array | float,
-) -> tuple[jax.Array, Extents]:
+) -> tuple[jax.Array, jax.Array]:
     """Bounds each cluster by a rectangle at every rotation, and rates them (larger is better).
 
     With d the distance of a point to the nearest edge of its rectangle:
@@ -128,14 +125,14 @@ def try_rotations(
 
     Returns:
       curve: (A, P) float32.
-      extents: four (A, P) float32, m: lower and upper bounds of u, then of v; 0 without points.
+      extents: (4, A, P) float32, m: lower and upper bounds of u, then of v; 0 without points.
 
     Reference: paper, Algorithm III; oracles `jaxbox.reference.criterion_curve`, cv2.minAreaRect.
     """
     angle = (np.arange(num_angles) * (math.pi / 2 / num_angles))[:, None]
     cos, sin = jnp.asarray(np.cos(angle), jnp.float32), jnp.asarray(np.sin(angle), jnp.float32)
 
-    def rate(cluster: jax.Array) -> tuple[jax.Array, Extents]:
+    def rate(cluster: jax.Array) -> tuple[jax.Array, jax.Array]:
         clusters = points.table(cluster)
         extents = _extents(clusters, cos, sin)
         return _CRITERIA[criterion](clusters, cos, sin, extents, min_distance_m), extents
@@ -143,9 +140,9 @@ def try_rotations(
     return map_rows(rate, cluster, num_rows=num_clusters, chunk=CHUNK, axis=-1)
 
 
-def _extents(clusters: PointTable, cos: jax.Array, sin: jax.Array) -> Extents:
-    # Of the four directions u, v, -u and -v, how far the cluster reaches: one kernel, and one array.
-    to_x, to_y = jnp.concatenate([cos, -sin, -cos, sin]), jnp.concatenate([sin, cos, -sin, -cos])
+def _extents(clusters: PointTable, cos: jax.Array, sin: jax.Array) -> jax.Array:
+    # How far the cluster reaches along -u, u, -v and v: one kernel, and one array.
+    to_x, to_y = jnp.concatenate([-cos, cos, sin, -sin]), jnp.concatenate([-sin, sin, -cos, cos])
 
     def update(reach: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
         return jnp.maximum(reach, _along(x, y, to_x, to_y))
@@ -154,8 +151,8 @@ def _extents(clusters: PointTable, cos: jax.Array, sin: jax.Array) -> Extents:
     # A point that is absent is seen as the first once more; a cluster without any has a first one anyhow.
     nearest = jnp.full((to_x.shape[0], x.shape[1]), -jnp.inf)
     reach = fold_points(x, y, count, nearest, update, absent=(x[0], y[0]))
-    u1, v1, u0, v0 = jnp.split(jnp.where(count > 0, reach, 0), 4)
-    return -u0, u1, -v0, v1
+    sign = jnp.array([-1.0, 1.0, -1.0, 1.0])[:, None, None]
+    return sign * jnp.where(count > 0, reach, 0).reshape(4, -1, x.shape[1])
 
 
 def _along(x: jax.Array, y: jax.Array, to_x: jax.Array, to_y: jax.Array) -> jax.Array:
@@ -172,14 +169,14 @@ def _absent(num_angles: int) -> tuple[float, float]:
 
 
 def _area(
-    clusters: PointTable, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
+    clusters: PointTable, cos: jax.Array, sin: jax.Array, extents: jax.Array, d0: jax.Array | float
 ) -> jax.Array:
     u0, u1, v0, v1 = extents
     return -(u1 - u0) * (v1 - v0)
 
 
 def _closeness(
-    clusters: PointTable, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
+    clusters: PointTable, cos: jax.Array, sin: jax.Array, extents: jax.Array, d0: jax.Array | float
 ) -> jax.Array:
     u0, u1, v0, v1 = extents
 
@@ -195,7 +192,7 @@ def _to_edge(u: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
 
 
 def _visible_closeness(
-    clusters: PointTable, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
+    clusters: PointTable, cos: jax.Array, sin: jax.Array, extents: jax.Array, d0: jax.Array | float
 ) -> jax.Array:
     u0, u1, v0, v1 = extents
     # The sensor is the origin: of two opposite edges it sees the one nearer to 0.
@@ -227,7 +224,7 @@ def _mean_closeness(
 
 
 def _variance(
-    clusters: PointTable, cos: jax.Array, sin: jax.Array, extents: Extents, d0: jax.Array | float
+    clusters: PointTable, cos: jax.Array, sin: jax.Array, extents: jax.Array, d0: jax.Array | float
 ) -> jax.Array:
     u0, u1, v0, v1 = extents
     minus_sin = -sin
@@ -261,13 +258,13 @@ _CRITERIA = {
 
 
 def best_rectangles(
-    curve: jax.Array, extents: Extents, preference: jax.Array, *, insistence: float = 1.0
+    curve: jax.Array, extents: jax.Array, preference: jax.Array, *, insistence: float = 1.0
 ) -> Rectangles:
     """The rectangle at each cluster's best rotation.
 
     Args:
       curve: (A, P) float32, see `try_rotations`.
-      extents: see `try_rotations`.
+      extents: (4, A, P) float32, m, likewise.
       preference: (A,) float32, added to every curve.
       insistence: how often the preference counts when the rotation is chosen; its worth counts it once.
 
@@ -279,7 +276,8 @@ def best_rectangles(
     # An argmax does not vectorise (XLA, CPU).
     is_best = total >= jnp.max(total, axis=0)
     best = jnp.min(jnp.where(is_best, jnp.arange(num_angles)[:, None], num_angles - 1), axis=0)
-    u0, u1, v0, v1, worth = (jnp.take_along_axis(a, best[None], axis=0)[0] for a in (*extents, curve))
+    u0, u1, v0, v1 = jnp.take_along_axis(extents, best[None, None], axis=1)[:, 0]
+    worth = jnp.take_along_axis(curve, best[None], axis=0)[0]
     return Rectangles(
         angle=best * (math.pi / 2 / num_angles),
         low=jnp.stack([u0, v0], axis=1),

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxbox import box, completion, evidence, hull
 from jaxbox.config import CompletionConfig, DetectorConfig
 from jaxbox.grouping import largest_first
-from jaxbox.masked import compact, lookup, map_rows, take
+from jaxbox.masked import compact, lookup, map_rows, store, take
 from jaxbox.steps.common import class_values, stage_options
 from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals, Trials, list_trials, longest_side
@@ -22,6 +22,9 @@ INSISTENCE = 5.0
 
 PROPOSAL_CHUNK = 256
 """Proposals held against the evidence at a time: a loop over their points has few, wide steps."""
+
+NUM_BANDS = 4
+"""Bands of sizes by which proposals are ordered before."""
 
 VOTER_CHUNK = 64
 """Boxes that may vote for the scene's direction at a time: there are few."""
@@ -36,7 +39,7 @@ class Fits:
     """All rotations of all clusters, and the points that they were fitted to."""
 
     curve: jax.Array  # (A, P), the clusters with most points first
-    extents: box.Extents  # likewise
+    extents: jax.Array  # (4, A, P) likewise
     place: jax.Array  # (P,) where each cluster is in those
     points: box.PointLists  # of P clusters
     hull_vertices: jax.Array  # () of the largest hull that was fitted to; 0 where none was
@@ -64,7 +67,7 @@ def best_rectangles(
 ) -> Rectangles:
     """The rectangle of each cluster at its best rotation, see `box.best_rectangles`."""
 
-    def best(rotations: tuple[jax.Array, box.Extents]) -> Rectangles:
+    def best(rotations: tuple[jax.Array, jax.Array]) -> Rectangles:
         rectangles = box.best_rectangles(*rotations, preference, insistence=insistence)
         return jax.tree.map(jnp.transpose, rectangles)
 
@@ -246,7 +249,7 @@ def _judge_ways(
     """The best placement of each possible way of each trial, and its J: (W, Q) each."""
     settings = config.completion
     num_trials = possible.shape[1]
-    index, num = compact(possible.reshape(-1), possible.size)
+    index, num = _largest_first(possible, take(points.count, trials.cluster), points.max_points)
     names = ("length_m", "width_m")
 
     def judge(index: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -272,6 +275,21 @@ def _judge_ways(
     everywhere = jnp.zeros(possible.size, jnp.int32).at[index].set(placement, mode="drop")
     judged = jnp.full(possible.size, NOT_A_BOX).at[index].set(objective, mode="drop")
     return everywhere.reshape(possible.shape), judged.reshape(possible.shape)
+
+
+def _largest_first(
+    possible: jax.Array, num_points: jax.Array, max_points: int
+) -> tuple[jax.Array, jax.Array]:
+    """Entries of a table (W, Q) that are True, those of trials with many points roughly first; their number.
+
+    A loop over the points of a chunk of trials ends with the largest of them: so like sizes belong together.
+    """
+    band = jnp.minimum(num_points * NUM_BANDS // max_points, NUM_BANDS - 1)
+    # Stored, or each word of flags would work it out bit by bit.
+    possible, band = store((possible, band), jnp.all(num_points >= 0))
+    flags = possible & (band == jnp.arange(NUM_BANDS)[::-1, None, None])
+    index, num = compact(flags.reshape(-1), possible.size)
+    return jnp.where(index < flags.size, index % possible.size, possible.size), num
 
 
 _SIDE_FIELDS = ("seen_length", "seen_width", "seen_weight", "length_margin_m", "width_margin_m")
