@@ -285,6 +285,9 @@ class CompletionConfig:
 class VehicleConfig:
     """Vehicle decision: gates, score and suppression."""
 
+    surroundings: bool = _static(default=True)
+    """static: judge a box, and measure its height, by all points in and round it; False keeps the height of
+    the cluster, and lets nothing round the box count (the paper)."""
     classes: tuple[ClassPrior, ClassPrior, ClassPrior] = (CAR, VAN, TRUCK)
     """Priors of car, van and truck."""
     large_height_m: Scalar = 1.7
@@ -369,6 +372,7 @@ class DetectorConfig:
             evidence=EvidenceConfig(enabled=False),
             box=BoxConfig(criterion="area", fit_to="hull", scene_direction=False),
             completion=CompletionConfig(mode="none"),
+            vehicles=VehicleConfig(surroundings=False),
         )
 
     @classmethod

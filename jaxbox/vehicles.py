@@ -139,6 +139,20 @@ def count_points_around(
     return map_rows(look, (frames, low, high), num_rows=num_boxes, chunk=BOX_CHUNK)
 
 
+def cluster_alone(num_points: jax.Array, top: jax.Array) -> Surroundings:
+    """What surrounds boxes of which only the clusters are looked at: nothing.
+
+    Args:
+      num_points: (P,) float32, of the clusters.
+      top: (P,) float32, m above the ground, of the clusters.
+
+    Returns:
+      The surroundings.
+    """
+    none = jnp.zeros_like(top)
+    return Surroundings(num_points, top, num_above=none, num_ring=none, num_upper=none, num_recessed=none)
+
+
 def _frames(boxes: jax.Array, count_max_height_m: jax.Array, recess_m: jax.Array) -> jax.Array:
     """(P, 11) what the points round a box are held against, see `_judge`."""
     x, y, length, width, yaw = boxes.T

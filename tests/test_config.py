@@ -73,6 +73,7 @@ def test_the_paper_preset_is_the_papers():
     assert (paper.ground.max_planes, paper.ground.surface, paper.ground.candidates) == (1, False, "points")
     assert (paper.box.criterion, paper.box.fit_to) == ("area", "hull")
     assert (paper.completion.mode, paper.evidence.enabled) == ("none", False)
+    assert not paper.vehicles.surroundings
     assert paper.clustering.adaptive_growth == 0
     assert [m.num_levels for m in paper.clustering.maps] == [13]
 

@@ -220,7 +220,7 @@ def _vertical(
     options = _surface_grid(settings) | select_options(settings.ground, "min_height_m")
     place = np.append(candidate.completed.box[:2], z)[None]
     ground_z = ground_elevation(place, ground.planes, ground.grid, **options)[0]
-    if settings.completion.mode == "none":
+    if not settings.vehicles.surroundings:
         bottom, top = candidate.proposal.bottom_m, candidate.proposal.top_m
         return ground_z + (bottom + top) / 2, top - bottom
     prior = settings.vehicles.classes[candidate.label]

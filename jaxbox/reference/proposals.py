@@ -314,17 +314,7 @@ def _judge(
 ) -> Candidate:
     vehicles, box = settings.vehicles, completed.box
     prior = vehicles.classes[label]
-    assert obstacles.tree is not None
-    near = obstacles.tree.query_ball_point(box[:2], np.hypot(box[2], box[3]) / 2 + 2 * vehicles.ring_m)
-    around = count_points_around(
-        box,
-        obstacles.xyz[near],
-        obstacles.height[near],
-        **select_options(vehicles, "margin_m", "ring_m", "upper_height_m", "stray_share"),
-        **select_options(settings.ground, "min_height_m", "max_height_m"),
-        count_max_height_m=prior.count_max_height_m,
-        recess_m=prior.recess_m,
-    )
+    around = _look_around(proposal, box, prior, obstacles, settings)
     rays = box_evidence(box[None], evidence, num_rays=settings.completion.num_final_rays)
     names = (
         "top_grade",
@@ -348,3 +338,22 @@ def _judge(
         **select_options(vehicles, *names),
     )
     return Candidate(proposal, completed, around, label, score)
+
+
+def _look_around(
+    proposal: Proposal, box: np.ndarray, prior: Any, obstacles: Obstacles, settings: Any
+) -> PointsAround:
+    vehicles = settings.vehicles
+    if not vehicles.surroundings:
+        return PointsAround(inside=len(proposal.members), top_m=proposal.top_m, overhead=0, ring=0)
+    assert obstacles.tree is not None
+    near = obstacles.tree.query_ball_point(box[:2], np.hypot(box[2], box[3]) / 2 + 2 * vehicles.ring_m)
+    return count_points_around(
+        box,
+        obstacles.xyz[near],
+        obstacles.height[near],
+        **select_options(vehicles, "margin_m", "ring_m", "upper_height_m", "stray_share"),
+        **select_options(settings.ground, "min_height_m", "max_height_m"),
+        count_max_height_m=prior.count_max_height_m,
+        recess_m=prior.recess_m,
+    )

@@ -54,20 +54,7 @@ def score_boxes(
     rectangle = take(rectangle, chosen)
     label, cluster = take(trials.label, chosen), take(trials.cluster, chosen, proposals.num_points.shape[0])
     prior = functools.partial(class_values, config, label=label)
-    around = vehicles.count_points_around(
-        rectangle,
-        prior("count_max_height_m"),
-        prior("recess_m"),
-        num,
-        obstacles.xy,
-        obstacles.height,
-        obstacles.count,
-        **stage_options(config.region),
-        margin_m=settings.margin_m,
-        ring_m=settings.ring_m,
-        upper_height_m=settings.upper_height_m,
-        stray_share=settings.stray_share,
-    )
+    around = _look_around(rectangle, label, cluster, num, proposals, obstacles, config)
     rho = jnp.linalg.norm(rectangle[:, :2], axis=1)
     late = vehicles.surroundings_score(
         around,
@@ -84,7 +71,7 @@ def score_boxes(
     )
     height = jnp.maximum(around.top + settings.top_margin_m, prior("min_box_height_m"))
     above = jnp.zeros_like(height)
-    if config.completion.mode == "none":
+    if not settings.surroundings:
         # The paper keeps the height of the cluster itself.
         above = take(proposals.min_height, cluster)
         height = take(proposals.max_height, cluster) - above
@@ -96,6 +83,36 @@ def score_boxes(
     unsorted = Candidates(rectangle, bottom, height, total, label, cluster, total > 0, jnp.zeros_like(label))
     ordered = jax.tree.map(lambda a: take(a, order), unsorted)
     return dataclasses.replace(ordered, num=num)
+
+
+def _look_around(
+    rectangle: jax.Array,
+    label: jax.Array,
+    cluster: jax.Array,
+    num: jax.Array,
+    proposals: Proposals,
+    obstacles: Obstacles,
+    config: DetectorConfig,
+) -> vehicles.Surroundings:
+    """What there is in and round each box: its cluster alone where the preset does not look round."""
+    settings = config.vehicles
+    if not settings.surroundings:
+        num_points = take(proposals.num_points, cluster).astype(jnp.float32)
+        return vehicles.cluster_alone(num_points, take(proposals.max_height, cluster))
+    return vehicles.count_points_around(
+        rectangle,
+        class_values(config, "count_max_height_m", label),
+        class_values(config, "recess_m", label),
+        num,
+        obstacles.xy,
+        obstacles.height,
+        obstacles.count,
+        **stage_options(config.region),
+        margin_m=settings.margin_m,
+        ring_m=settings.ring_m,
+        upper_height_m=settings.upper_height_m,
+        stray_share=settings.stray_share,
+    )
 
 
 def _early_score(
