@@ -113,12 +113,10 @@ def count_points_around(
 
     cell_of_point = cell(xy[:, 0], 0) * shape[1] + cell(xy[:, 1], 1)
 
-    def read(i: jax.Array) -> list[jax.Array]:
-        return [xy[i, 0], xy[i, 1], height[i]]
-
-    points, begin, end = sort_by_group(
-        read, cell_of_point, num_points, shape[0] * shape[1], room=BLOCK_POINTS
+    order, begin, end = sort_by_group(
+        lambda i: i, cell_of_point, num_points, shape[0] * shape[1], room=BLOCK_POINTS
     )
+    points = [jnp.take(values, order, mode="clip") for values in (xy[:, 0], xy[:, 1], height)]
     frames = _frames(boxes, count_max_height_m, recess_m)
     reach = jnp.abs(frames[:, 2:4]) * (frames[:, 4:5] + ring_m)
     reach = reach + jnp.abs(frames[:, 3:1:-1]) * (frames[:, 5:6] + ring_m)
