@@ -53,13 +53,30 @@ def fill_rows(xyz: np.ndarray, intensity: np.ndarray, rows: np.ndarray, padded: 
     if len(xyz) > len(rows):
         keep = _nearest(xyz, len(rows))
         xyz, intensity = xyz[keep], intensity[keep]
-    # Column by column: NumPy copies rows of three numbers one row at a time.
-    for axis in range(3):
-        rows[: len(xyz), axis] = xyz[:, axis]
-    rows[: len(xyz), 3] = 1
+    points = rows[: len(xyz)]
+    whole = _rows_of_four(xyz)
+    if whole is not None:
+        points[:] = whole
+    else:
+        # Column by column: NumPy copies rows of three numbers one row at a time.
+        for axis in range(3):
+            points[:, axis] = xyz[:, axis]
+    points[:, 3] = 1
     rows[len(xyz) :] = 0
     padded[: len(xyz)] = intensity
     padded[len(xyz) :] = 0
+
+
+def _rows_of_four(xyz: np.ndarray) -> np.ndarray | None:
+    """The rows that points are the first three numbers of, as in most files; None where they are not."""
+    memory, row_bytes = xyz.base, 4 * xyz.itemsize
+    if not isinstance(memory, np.ndarray) or xyz.strides != (row_bytes, xyz.itemsize):
+        return None
+    # Of the last three columns of four, the last row's fourth number would lie past the end.
+    end = memory.ctypes.data + memory.nbytes
+    if not memory.flags.c_contiguous or xyz.ctypes.data + row_bytes * len(xyz) > end:
+        return None
+    return np.lib.stride_tricks.as_strided(xyz, (len(xyz), 4), writeable=False)
 
 
 def checked_points(xyz: np.ndarray, intensity: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

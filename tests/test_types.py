@@ -76,6 +76,30 @@ def test_read_only_points_are_taken_and_left_alone():
     np.testing.assert_array_equal(points, POINTS)
 
 
+FOUR = np.random.default_rng(4).normal(size=(21, 4)).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        FOUR[:, :3],
+        FOUR[:, 1:],
+        FOUR[3:9, :3],
+        FOUR[3:, 1:],
+        FOUR[::2, :3],
+        FOUR[::-1, :3],
+        FOUR[:0, :3],
+        FOUR.T[:3, :7].T,
+    ],
+    ids=["first", "last", "some", "last of some", "every other", "backwards", "none", "columns of columns"],
+)
+def test_points_beside_another_number_are_those_points_and_one(points):
+    xyz, one, _ = rows(PointCloud.from_numpy(points, capacity=32))
+    np.testing.assert_array_equal(xyz[: len(points)], points)
+    np.testing.assert_array_equal(xyz[len(points) :], 0)
+    np.testing.assert_array_equal(one, np.arange(32) < len(points))
+
+
 def test_later_changes_of_the_array_do_not_reach_the_cloud():
     points = POINTS.copy()
     cloud = PointCloud.from_numpy(points, capacity=50)
