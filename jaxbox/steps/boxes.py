@@ -24,7 +24,7 @@ PROPOSAL_CHUNK = 256
 """Proposals held against the evidence at a time: a loop over their points has few, wide steps."""
 
 NUM_BANDS = 4
-"""Bands of sizes by which proposals are ordered before."""
+"""So many bands of cluster sizes put proposals in order, for chunks of like sizes."""
 
 VOTER_CHUNK = 64
 """Boxes that may vote for the scene's direction at a time: there are few."""
