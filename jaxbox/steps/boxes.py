@@ -249,7 +249,7 @@ def _judge_ways(
     """The best placement of each possible way of each trial, and its J: (W, Q) each."""
     settings = config.completion
     num_trials = possible.shape[1]
-    index, num = _largest_first(possible, take(points.count, trials.cluster), points.max_points)
+    index, num = _in_order_of_size(possible, take(points.count, trials.cluster), points.max_points)
     names = ("length_m", "width_m")
 
     def judge(index: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -277,12 +277,13 @@ def _judge_ways(
     return everywhere.reshape(possible.shape), judged.reshape(possible.shape)
 
 
-def _largest_first(
+def _in_order_of_size(
     possible: jax.Array, num_points: jax.Array, max_points: int
 ) -> tuple[jax.Array, jax.Array]:
     """Entries of a table (W, Q) that are True, those of trials with many points roughly first; their number.
 
     A loop over the points of a chunk of trials ends with the largest of them: so like sizes belong together.
+    Bands do for that; the exact order of `largest_first` would be one more sort.
     """
     band = jnp.minimum(num_points * NUM_BANDS // max_points, NUM_BANDS - 1)
     # Stored, or each word of flags would work it out bit by bit.
