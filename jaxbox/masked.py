@@ -10,12 +10,24 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 BLOCK = 512
 """Columns of the two-level prefix sum: XLA's CPU cumulative sum slows down with its length."""
 
 WORD_BITS = 32
 """Bits of a word of a set of flags."""
+
+BYTE_BITS = 8
+
+_PLACES_OF_BYTE = np.array(
+    [
+        [k for k in range(BYTE_BITS) if value >> k & 1] + [0] * (BYTE_BITS - value.bit_count())
+        for value in range(2**BYTE_BITS)
+    ],
+    np.uint8,
+)
+"""(256, 8): where the set bits of each byte are, lowest first; 0 beyond."""
 
 FOLD_UNROLL = 4
 """Points folded in one step of the loop over them."""
@@ -70,7 +82,7 @@ def compact(mask: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
     """
     return jax.lax.platform_dependent(
         mask,
-        cpu=functools.partial(_compact_one_by_one, capacity=capacity),
+        cpu=functools.partial(_compact_by_bytes, capacity=capacity),
         default=functools.partial(_compact_at_once, capacity=capacity),
     )
 
@@ -84,24 +96,27 @@ def _compact_at_once(mask: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.
     return index, order[-1]
 
 
-def _compact_one_by_one(mask: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.Array]:
-    """Bit after bit of words of flags: XLA compiles so small a loop to native code on the CPU."""
-    words = _words(mask)
+def _compact_by_bytes(mask: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.Array]:
+    """Byte after byte of flags: XLA compiles so small a loop to native code on the CPU.
 
-    def of_word(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        def of_bit(state: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-            word, index, count = state
-            lowest = jax.lax.population_count((word & -word) - 1).astype(jnp.int32)
-            index = index.at[jnp.minimum(count, capacity)].set(i * WORD_BITS + lowest)
-            return word & (word - 1), index, count + 1
+    Each writes eight indices, of which as many count as it has flags: the next byte writes over the others.
+    """
+    size = mask.shape[0]
+    flags = jnp.pad(mask, (0, -size % (2 * BYTE_BITS))).reshape(-1, BYTE_BITS)
+    values = jnp.sum(jnp.where(flags, 1 << jnp.arange(BYTE_BITS), 0), axis=1).astype(jnp.uint8)
+    places = jnp.asarray(_PLACES_OF_BYTE)
 
-        _, index, count = jax.lax.while_loop(lambda state: state[0] > 0, of_bit, (words[i], *state))
-        return index, count
+    def step(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        index, count = state
+        value = values[i].astype(jnp.int32)
+        new = i * BYTE_BITS + places[value].astype(jnp.int32)
+        # Beyond the capacity the start is moved back, to the room at the end.
+        index = jax.lax.dynamic_update_slice(index, new, (count,))
+        return index, count + jax.lax.population_count(value)
 
-    # One entry more takes what is beyond the capacity.
-    index = jnp.full(capacity + 1, mask.shape[0], jnp.int32)
-    index, count = jax.lax.fori_loop(0, words.shape[0], of_word, (index, jnp.int32(0)))
-    return index[:capacity], count
+    index = jnp.zeros(capacity + BYTE_BITS, jnp.int32)
+    index, count = jax.lax.fori_loop(0, values.shape[0], step, (index, jnp.int32(0)), unroll=2)
+    return jnp.where(jnp.arange(capacity) < count, index[:capacity], size), count
 
 
 def _words(mask: jax.Array) -> jax.Array:

@@ -193,7 +193,7 @@ def test_fold_points_sees_each_point_of_each_cluster_once_and_in_order():
 def test_both_ways_to_compact_give_the_same(share, capacity):
     for size in (1, 31, 32, 1000):
         mask = jnp.asarray(np.random.default_rng(size).random(size) < share)
-        ways = masked._compact_one_by_one, masked._compact_at_once
+        ways = masked._compact_by_bytes, masked._compact_at_once
         one, other = (way(mask, capacity=capacity) for way in ways)
         np.testing.assert_array_equal(one[0], other[0])
         assert int(one[1]) == int(other[1]) == int(mask.sum())

@@ -140,7 +140,8 @@ def _owners(
             inside = jnp.abs(dx * cos + dy * sin) <= half_length
             inside = inside & (jnp.abs(dy * cos - dx * sin) <= half_width)
             owner = jnp.minimum(owner, jnp.where(inside, detection, num_detections))
-        return owner
+        # Look-ups do not vectorise within the write of a chunk (XLA, CPU).
+        return store(owner, obstacles.count >= 0)
 
     return asked, map_rows(own, asked, num_rows=num_asked, chunk=OWNER_CHUNK), num_asked
 
