@@ -1,12 +1,11 @@
 """Convex hulls of many clusters at a fixed shape (paper, section 3.3)."""
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import WORD_BITS, fold_rows, take
+from jaxbox.masked import WORD_BITS, fold_rows, lookup, store, take
 
 POINT_CHUNK = 4096
 """Points looked at together."""
@@ -40,7 +39,7 @@ def extreme_points(
       num_slices: static, S.
 
     Returns:
-      (K, 4 S) int32: rows of points, some of them twice; N where a slice is empty.
+      (4 S, K) int32: rows of points, some of them twice; N where a slice is empty.
 
     Reference: tested against cv2.convexHull of all points.
     """
@@ -81,82 +80,95 @@ def extreme_points(
             # the point's index in one word. (Conversions to int32 vectorise, those to uint32 do not.)
             quantised = (across * (2**value_bits - 1)).astype(jnp.int32).astype(jnp.uint32)
             key = (quantised << index_bits) | (index.astype(jnp.uint32) + 1)
-            new.append(before.at[slot * num_slices + piece].max(key, mode="drop"))
+            cell = jnp.where(slot < num_clusters, piece * num_clusters + slot, num_slices * num_clusters)
+            new.append(before.at[cell].max(key, mode="drop"))
         return new
 
-    best = fold(keep_extremes, [jnp.zeros(num_clusters * num_slices, jnp.uint32)] * 4)
-    best = jnp.concatenate([b.reshape(num_clusters, num_slices) for b in best], axis=1)
+    best = fold(keep_extremes, [jnp.zeros(num_slices * num_clusters, jnp.uint32)] * 4)
+    best = jnp.concatenate(best).reshape(-1, num_clusters)
     index = (best & (2**index_bits - 1)).astype(jnp.int32)
     return jnp.where(index > 0, take(row, jnp.maximum(index - 1, 0)), xy.shape[0])
 
 
-def convex_hulls(xy: jax.Array, valid: jax.Array, *, max_vertices: int) -> tuple[jax.Array, jax.Array]:
+def convex_hulls(
+    x: jax.Array, y: jax.Array, valid: jax.Array, *, max_vertices: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Convex hulls of clusters, counter-clockwise from their leftmost points (gift wrapping).
 
     From a vertex of the lower hull, the next is the point on its right at the least slope. The upper hull
-    is the lower one of the points turned by half a turn, so that all chains grow side by side.
+    is the lower one of the points turned by half a turn, so that all chains grow side by side. Clusters lie
+    along the last axis: reductions along the other vectorise (XLA, CPU).
 
     Args:
-      xy: (C, M, 2) float32, m.
-      valid: (C, M) bool.
+      x: (M, C) float32, m.
+      y: (M, C) float32, m.
+      valid: (M, C) bool.
       max_vertices: static, H.
 
     Returns:
-      vertices: (C, H, 2) float32, m, padded by repeating the last; where there are more than H, every so
-        many are kept, evenly round the hull; zeros where no point is valid.
+      x: (H, C) float32, m, of the vertices, padded by repeating the last; where there are more than H,
+        every so many are kept, evenly round the hull; zeros where no point is valid.
+      y: (H, C) float32, m, likewise.
       num_vertices: (C,) int32, the true number, which may exceed H.
 
     Reference: paper, section 3.3 and equation 6; oracle cv2.convexHull.
     """
-    size = valid.shape[0]
-    # Points along the leading axis: reductions along it vectorise (XLA, CPU).
-    x, y = (jnp.concatenate([v.T, -v.T], axis=1) for v in (xy[..., 0], xy[..., 1]))
-    chain_x, chain_y, count = _lower_hulls(x, y, jnp.concatenate([valid.T, valid.T], axis=1))
+    size = valid.shape[1]
+    x = jnp.where(valid, x, jnp.nan)
+    chain_x, chain_y, count = _lower_hulls(*store([_both_ways(x), _both_ways(y)], y[0, 0] < jnp.inf))
     # A chain that ends where the other begins leaves that point to it.
     end = jnp.maximum(count - 1, 0), jnp.arange(2 * size)
     closes_x, closes_y = (chain[end] == -jnp.roll(chain[0], size) for chain in (chain_x, chain_y))
     count = count - (closes_x & closes_y & (count > 0))
     # Points all in one place close both chains.
-    num_lower = jnp.maximum(count[:size], jnp.any(valid, axis=1))
-    num_vertices = num_lower + count[size:]
-    j, num = jnp.arange(max_vertices), num_vertices[:, None]
+    num_lower = jnp.maximum(count[:size], jnp.any(valid, axis=0))
+    num = num_lower + count[size:]
+    j = jnp.arange(max_vertices)[:, None]
     pick = jnp.where(num > max_vertices, j * num // max_vertices, jnp.maximum(jnp.minimum(j, num - 1), 0))
-    is_lower = pick < num_lower[:, None]
-    row = jnp.where(is_lower, pick, pick - num_lower[:, None])
-    column = jnp.arange(size)[:, None] + jnp.where(is_lower, 0, size)
-    vertices = jnp.stack([chain_x[row, column], chain_y[row, column]], axis=2)
-    return jnp.where(is_lower[..., None], vertices, -vertices), num_vertices
+    is_lower = pick < num_lower
+    place = jnp.where(is_lower, pick, pick - num_lower), jnp.arange(size) + jnp.where(is_lower, 0, size)
+    # Stored: a look-up vectorises neither with what finds its place, nor within the write of a chunk (XLA).
+    place = store(place, num[0] >= 0)
+    x, y = store([lookup(chain, *place) for chain in (chain_x, chain_y)], num[0] >= 0)
+    return jnp.where(is_lower, x, -x), jnp.where(is_lower, y, -y), num
 
 
-def _lower_hulls(x: jax.Array, y: jax.Array, valid: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _both_ways(values: jax.Array) -> jax.Array:
+    """(M, 2 C): values (M, C) and their negatives. A product, since a concatenation does not vectorise."""
+    return (values[:, None] * jnp.array([[1], [-1]], values.dtype)).reshape(values.shape[0], -1)
+
+
+def _lower_hulls(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Lower hulls of point sets (M, C), from left to right, and how many vertices each has, (C,).
 
-    Of points above one another only the lowest counts. Rows beyond the last vertex are zero or repeat it.
+    Of points above one another only the lowest counts; those whose x is not a number are absent. Rows
+    beyond the last vertex repeat it, or are minus infinity; the first row of an empty set is zero.
     """
     far = jnp.inf
 
-    def step(state: Any) -> Any:
-        i, at_x, at_y, grows, chain_x, chain_y, count = state
-        chain_x = jax.lax.dynamic_update_index_in_dim(chain_x, at_x, i, 0)
-        chain_y = jax.lax.dynamic_update_index_in_dim(chain_y, at_y, i, 0)
-        dx, dy = x - at_x, y - at_y
-        right = valid & (dx > 0)
-        slope = jnp.where(right, dy / jnp.where(right, dx, 1), far)
+    def step(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        i, _, chain_x, chain_y = state
+        at_x, at_y = chain_x[i], chain_y[i]
+        slope = jnp.where(x > at_x, (y - at_y) / (x - at_x), far)
+        least = jnp.min(slope, axis=0)
         # Of points on a line the farthest.
-        best = right & (slope == jnp.min(slope, axis=0))
-        next_x = jnp.max(jnp.where(best, x, -far), axis=0)
-        next_y = jnp.min(jnp.where(best & (x == next_x), y, far), axis=0)
-        count, grows = count + grows, next_x > -far
-        at_x, at_y = jnp.where(grows, next_x, at_x), jnp.where(grows, next_y, at_y)
-        return i + 1, at_x, at_y, grows, chain_x, chain_y, count
+        next_x = jnp.max(jnp.where(slope == least, x, -far), axis=0)
+        next_y = jnp.min(jnp.where((slope == least) & (x == next_x), y, far), axis=0)
+        grows = least < far
+        chain_x = chain_x.at[i + 1].set(jnp.where(grows, next_x, at_x))
+        chain_y = chain_y.at[i + 1].set(jnp.where(grows, next_y, at_y))
+        return i + 1, jnp.any(grows), chain_x, chain_y
 
-    left = jnp.min(jnp.where(valid, x, far), axis=0)
-    lowest = jnp.min(jnp.where(valid & (x == left), y, far), axis=0)
-    present = jnp.any(valid, axis=0)
-    start = jnp.where(present, left, 0), jnp.where(present, lowest, 0)
-    state = (0, *start, present, jnp.zeros_like(x), jnp.zeros_like(y), jnp.zeros(x.shape[1], jnp.int32))
-    *_, chain_x, chain_y, count = jax.lax.while_loop(lambda state: jnp.any(state[3]), step, state)
-    return chain_x, chain_y, count
+    left = jnp.min(jnp.where(x > -far, x, far), axis=0)
+    lowest = jnp.min(jnp.where(x == left, y, far), axis=0)
+    present = left < far
+    # One row more, for the step that finds that no chain grows.
+    chain = jnp.full((x.shape[0] + 1, x.shape[1]), -far)
+    chains = (chain.at[0].set(jnp.where(present, of_left, 0)) for of_left in (left, lowest))
+    *_, chain_x, chain_y = jax.lax.while_loop(
+        lambda state: state[1], step, (jnp.int32(0), jnp.any(present), *chains)
+    )
+    return chain_x, chain_y, present + jnp.sum(chain_x[1:] > chain_x[:-1], axis=0)
 
 
 def polygon_area(vertices: jax.Array) -> jax.Array:

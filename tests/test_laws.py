@@ -55,8 +55,8 @@ def padded(xy):
 
 def hull_of(xy):
     """(h, 2) vertices of the hull of one cluster."""
-    vertices, count = _hulls(padded(xy)[None], np.arange(NUM_POINTS)[None] < len(xy))
-    return np.asarray(vertices[0, : count[0]])
+    x, y, count = _hulls(*padded(xy).T[..., None], np.arange(NUM_POINTS)[:, None] < len(xy))
+    return np.column_stack([x, y])[: count[0]]
 
 
 @jax.jit

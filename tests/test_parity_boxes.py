@@ -26,7 +26,12 @@ MAX_FITS = 4096
 extreme_points = jax.jit(
     functools.partial(hull.extreme_points, num_clusters=parity.MAX_CLUSTERS, num_slices=NUM_SLICES)
 )
-trace_hulls = functools.partial(hull.convex_hulls, max_vertices=MAX_VERTICES)
+
+
+def trace_hulls(points, valid):
+    """Hulls (C, H, 2) of clusters (C, M, 2)."""
+    *vertices, count = hull.convex_hulls(*points.T, valid.T, max_vertices=MAX_VERTICES)
+    return jnp.array(vertices).T, count
 
 
 @jax.jit
@@ -137,7 +142,7 @@ def test_extreme_points_lose_at_most_a_slice_of_the_hull(cases):
             len(xy),
             parity.pad(xy, parity.MAX_OBSTACLES),
         )
-        index = np.asarray(extreme_points(*rows))
+        index = np.asarray(extreme_points(*rows)).T
         for k in range(len(case.proposals)):
             kept = index[k][index[k] < len(xy)]
             assert np.all(case.slot[kept] == k)

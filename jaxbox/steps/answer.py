@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxbox import descriptors, hull, vehicles
 from jaxbox.config import DetectorConfig
 from jaxbox.masked import compact, count_true, fold_rows, lookup, map_rows, store, take
-from jaxbox.steps.boxes import HULL_CHUNK, Fits, max_slab_points, trace_hulls
+from jaxbox.steps.boxes import Fits, max_slab_points, trace_hulls
 from jaxbox.steps.decision import Candidates
 from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals
@@ -102,8 +102,8 @@ def _describe(
         num_clusters=config.vehicles.max_detections,
         num_slices=config.hull.num_slices,
     )
-    trace = functools.partial(trace_hulls, xy, max_vertices=config.hull.max_vertices)
-    vertices, num_vertices = map_rows(trace, outline, num_rows=num, chunk=HULL_CHUNK)
+    x, y, num_vertices = trace_hulls(xy, outline, num, config)
+    vertices = jnp.stack([x.T, y.T], axis=2)
     moments = descriptors.point_moments(owner, row, num_rows, xy, kept.rectangle[:, :2])
     shapes = descriptors.shape_descriptors(moments, hull.polygon_area(vertices), num_vertices)
     return moments[:, 0].astype(jnp.int32), Hulls(vertices, num_vertices), shapes

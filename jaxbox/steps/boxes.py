@@ -85,17 +85,25 @@ def _hull_points(
     index = hull.extreme_points(
         cluster, row, num, obstacles.xy, num_clusters=num_clusters, num_slices=config.hull.num_slices
     )
-    trace = functools.partial(trace_hulls, obstacles.xy, max_vertices=config.hull.max_vertices)
-    vertices, count = map_rows(trace, index, num_rows=proposals.num_clusters, chunk=HULL_CHUNK)
-    x, y = vertices.reshape(-1, 2).T
+    x, y, count = trace_hulls(obstacles.xy, index, proposals.num_clusters, config)
     start = jnp.arange(count.shape[0]) * config.hull.max_vertices
     listed = jnp.minimum(count, config.hull.max_vertices)
-    return box.PointLists(x, y, start, listed, config.hull.max_vertices), jnp.max(count)
+    return box.PointLists(x.T.reshape(-1), y.T.reshape(-1), start, listed, config.hull.max_vertices), jnp.max(
+        count
+    )
 
 
-def trace_hulls(xy: jax.Array, index: jax.Array, *, max_vertices: int) -> tuple[jax.Array, jax.Array]:
-    """Hulls of the clusters whose points are listed: (C, H, 2) m, and their true numbers of vertices."""
-    return hull.convex_hulls(take(xy, index), index < xy.shape[0], max_vertices=max_vertices)
+def trace_hulls(
+    xy: jax.Array, index: jax.Array, num_clusters: jax.Array, config: DetectorConfig
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Hulls of the clusters whose points (M, C) are listed, see `hull.convex_hulls`."""
+
+    def trace(index: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        # Stored, or each of the hulls' steps that read them would look them up.
+        x, y = store([jnp.take(xy[:, axis], index, mode="clip") for axis in (0, 1)], num_clusters > 0)
+        return hull.convex_hulls(x, y, index < xy.shape[0], max_vertices=config.hull.max_vertices)
+
+    return map_rows(trace, index, num_rows=num_clusters, chunk=HULL_CHUNK, axis=-1)
 
 
 def _slab_points(
