@@ -432,12 +432,13 @@ def select_clusters(
         listed = keep & (place > 0) & (place <= size)
         row = jnp.where(listed, place - 1 + jnp.sum(kept[:i]), row)
     member = jnp.full(capacity, num_points.shape[0]).at[row].set(component, mode="drop")
+    upper = take(upper, member)
     return Clusters(
         row=row,
         num_points=take(num_points, member),
         num_slab=take(statistics.count[:, 1], member),
-        min_height=-take(upper[:, 5], member),
-        max_height=take(upper[:, 2], member),
+        low=-upper[:, 3:6],
+        high=upper[:, :3],
         found=found,
         kept=kept,
     )

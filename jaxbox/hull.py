@@ -1,7 +1,5 @@
 """Convex hulls of many clusters at a fixed shape (paper, section 3.3)."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 
@@ -14,13 +12,44 @@ MIN_EXTENT_M = 1e-6
 """Clusters narrower than this are cut as if they were so wide: all their points are in one slice."""
 
 
+def find_bounds(
+    slot: jax.Array, row: jax.Array, num_rows: jax.Array, xy: jax.Array, *, num_clusters: int
+) -> tuple[jax.Array, jax.Array]:
+    """Least and greatest x and y of each cluster.
+
+    Args:
+      slot: (L,) int32 cluster of each point of a list, `num_clusters` for none.
+      row: (L,) int32 rows of those points.
+      num_rows: () int32; only the first so many of the list count.
+      xy: (N, 2) float32, m.
+      num_clusters: static, K.
+
+    Returns:
+      low: (K, 2) float32, m; infinite where a cluster has no point.
+      high: (K, 2) float32, m; likewise, minus infinity.
+    """
+    # Low bounds are high ones of the points turned by half a turn.
+    sign = jnp.array([[1.0], [-1.0]])
+
+    def widen(bounds: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
+        slot, row = rows
+        both = take(xy, row)[:, None] * sign
+        return bounds.at[slot].max(both.reshape(-1, 4), mode="drop")
+
+    none = jnp.full((num_clusters, 4), -jnp.inf)
+    absent = num_clusters, xy.shape[0]
+    bounds = fold_rows(widen, none, (slot, row), num_rows=num_rows, chunk=POINT_CHUNK, absent=absent)
+    return -bounds[:, 2:], bounds[:, :2]
+
+
 def extreme_points(
     slot: jax.Array,
     row: jax.Array,
     num_rows: jax.Array,
     xy: jax.Array,
+    low: jax.Array,
+    high: jax.Array,
     *,
-    num_clusters: int,
     num_slices: int,
 ) -> jax.Array:
     """The points of each cluster that can reach its hull: the extremes of thin slices.
@@ -31,11 +60,12 @@ def extreme_points(
     extent / 2^11 for sweeps of up to a million points.
 
     Args:
-      slot: (L,) int32 cluster of each point of a list, `num_clusters` for none.
+      slot: (L,) int32 cluster of each point of a list, K for none.
       row: (L,) int32 rows of those points.
       num_rows: () int32; only the first so many of the list count.
       xy: (N, 2) float32, m.
-      num_clusters: static, K.
+      low: (K, 2) float32, m, least x and y of each cluster.
+      high: (K, 2) float32, m, greatest x and y.
       num_slices: static, S.
 
     Returns:
@@ -43,27 +73,11 @@ def extreme_points(
 
     Reference: tested against cv2.convexHull of all points.
     """
+    num_clusters = low.shape[0]
     index_bits = row.shape[0].bit_length()
     # More bits than float32 holds would round the largest value up, out of the word.
     value_bits = min(WORD_BITS - index_bits, 24)
-    fold = functools.partial(
-        fold_rows,
-        rows=(slot, row),
-        num_rows=num_rows,
-        chunk=POINT_CHUNK,
-        absent=(num_clusters, xy.shape[0]),
-    )
-    # Low bounds are high ones of the points turned by half a turn.
-    sign = jnp.array([[1.0], [-1.0]])
-
-    def widen(bounds: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
-        slot, row = rows
-        both = take(xy, row)[:, None] * sign
-        return bounds.at[slot].max(both.reshape(-1, 4), mode="drop")
-
-    bounds = fold(widen, jnp.full((num_clusters, 4), -jnp.inf))
-    low, extent = -bounds[:, 2:], bounds[:, :2] + bounds[:, 2:]
-    frame = jnp.concatenate([low, 1 / jnp.maximum(extent, MIN_EXTENT_M)], axis=1)
+    frame = jnp.concatenate([low, 1 / jnp.maximum(high - low, MIN_EXTENT_M)], axis=1)
 
     def keep_extremes(
         best: list[jax.Array], index: jax.Array, rows: tuple[jax.Array, jax.Array]
@@ -84,7 +98,9 @@ def extreme_points(
             new.append(before.at[cell].max(key, mode="drop"))
         return new
 
-    best = fold(keep_extremes, [jnp.zeros(num_slices * num_clusters, jnp.uint32)] * 4)
+    none = [jnp.zeros(num_slices * num_clusters, jnp.uint32)] * 4
+    absent = num_clusters, xy.shape[0]
+    best = fold_rows(keep_extremes, none, (slot, row), num_rows=num_rows, chunk=POINT_CHUNK, absent=absent)
     best = jnp.concatenate(best).reshape(-1, num_clusters)
     index = (best & (2**index_bits - 1)).astype(jnp.int32)
     return jnp.where(index > 0, take(row, jnp.maximum(index - 1, 0)), xy.shape[0])

@@ -184,10 +184,10 @@ class Clusters:
     """(P,) int32: points of each cluster; 0 for an empty row."""
     num_slab: jax.Array
     """(P,) int32: those of them between the slab's heights."""
-    min_height: jax.Array
-    """(P,) float32, m: height above the ground of the cluster's lowest point; 0 for an empty row."""
-    max_height: jax.Array
-    """(P,) float32, m: height above the ground of the cluster's highest point; 0 for an empty row."""
+    low: jax.Array
+    """(P, 3) float32, m: least x, y and height above the ground of each cluster; 0 for an empty row."""
+    high: jax.Array
+    """(P, 3) float32, m: greatest ones."""
     found: jax.Array
     """(maps,) int32: clusters of each map that pass the gates, which may exceed its capacity."""
     kept: jax.Array

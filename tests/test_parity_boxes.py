@@ -1,7 +1,6 @@
 """Parity with the reference and OpenCV: hulls, rectangles, the scene's direction, descriptors."""
 
 import dataclasses
-import functools
 import math
 import types
 
@@ -23,9 +22,11 @@ MAX_VERTICES = 128
 MAX_FITS = 4096
 """Rows for the clusters of all cases of a kind."""
 
-extreme_points = jax.jit(
-    functools.partial(hull.extreme_points, num_clusters=parity.MAX_CLUSTERS, num_slices=NUM_SLICES)
-)
+
+@jax.jit
+def extreme_points(*rows):
+    bounds = hull.find_bounds(*rows, num_clusters=parity.MAX_CLUSTERS)
+    return hull.extreme_points(*rows, *bounds, num_slices=NUM_SLICES)
 
 
 def trace_hulls(points, valid):
@@ -316,7 +317,11 @@ def test_a_hull_beyond_its_capacity_is_fitted_to_by_its_own_vertices():
     away = np.array([10, 0])
     obstacles = types.SimpleNamespace(xy=jnp.float32(np.concatenate([disc + away, disc - away])))
     proposals = types.SimpleNamespace(
-        cluster=jnp.repeat(jnp.arange(2), 40)[None], num_points=jnp.array([40, 40]), num_clusters=jnp.int32(2)
+        cluster=jnp.repeat(jnp.arange(2), 40)[None],
+        num_points=jnp.array([40, 40]),
+        num_clusters=jnp.int32(2),
+        low=jnp.array([[9.0, -1], [-11, -1]]),
+        high=jnp.array([[11.0, 1], [-9, 1]]),
     )
     fits = jax.jit(lambda: steps.fit_rectangles(obstacles, proposals, config))()
     assert int(fits.hull_vertices) == 40

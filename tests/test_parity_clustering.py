@@ -175,9 +175,9 @@ def test_clusters_that_pass_the_gates_are_exactly_those_of_the_reference(cases, 
         np.testing.assert_array_equal(
             clusters.num_slab[:count], np.bincount(slot[slot >= 0], in_slab[slot >= 0])
         )
-        heights = [height[slot == k] for k in range(count)]
-        np.testing.assert_array_equal(clusters.min_height[:count], [h.min() for h in heights])
-        np.testing.assert_array_equal(clusters.max_height[:count], [h.max() for h in heights])
+        members = [np.column_stack([xy, height])[slot == k] for k in range(count)]
+        np.testing.assert_array_equal(clusters.low[:count], [points.min(axis=0) for points in members])
+        np.testing.assert_array_equal(clusters.high[:count], [points.max(axis=0) for points in members])
 
 
 def test_the_lists_of_the_maps_join_without_gaps_and_end_at_their_capacities():

@@ -94,17 +94,12 @@ def _describe(
     config: DetectorConfig,
 ) -> tuple[jax.Array, Hulls, Descriptors]:
     """How many points each detection has, and their hull and shape."""
-    outline = hull.extreme_points(
-        owner,
-        row,
-        num_rows,
-        xy,
-        num_clusters=config.vehicles.max_detections,
-        num_slices=config.hull.num_slices,
-    )
+    rows = owner, row, num_rows, xy
+    bounds = hull.find_bounds(*rows, num_clusters=config.vehicles.max_detections)
+    outline = hull.extreme_points(*rows, *bounds, num_slices=config.hull.num_slices)
     x, y, num_vertices = trace_hulls(xy, outline, num, config)
     vertices = jnp.stack([x.T, y.T], axis=2)
-    moments = descriptors.point_moments(owner, row, num_rows, xy, kept.rectangle[:, :2])
+    moments = descriptors.point_moments(*rows, kept.rectangle[:, :2])
     shapes = descriptors.shape_descriptors(moments, hull.polygon_area(vertices), num_vertices)
     return moments[:, 0].astype(jnp.int32), Hulls(vertices, num_vertices), shapes
 

@@ -82,9 +82,8 @@ def _hull_points(
     """The hull of each cluster, as the points that its rectangle is fitted to (the paper)."""
     num_clusters = proposals.num_points.shape[0]
     cluster, row, num = _list_points(proposals, proposals.cluster < num_clusters, proposals.cluster.size)
-    index = hull.extreme_points(
-        cluster, row, num, obstacles.xy, num_clusters=num_clusters, num_slices=config.hull.num_slices
-    )
+    bounds = proposals.low[:, :2], proposals.high[:, :2]
+    index = hull.extreme_points(cluster, row, num, obstacles.xy, *bounds, num_slices=config.hull.num_slices)
     x, y, count = trace_hulls(obstacles.xy, index, proposals.num_clusters, config)
     start = jnp.arange(count.shape[0]) * config.hull.max_vertices
     listed = jnp.minimum(count, config.hull.max_vertices)

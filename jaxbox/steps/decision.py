@@ -73,8 +73,8 @@ def score_boxes(
     above = jnp.zeros_like(height)
     if not settings.surroundings:
         # The paper keeps the height of the cluster itself.
-        above = take(proposals.min_height, cluster)
-        height = take(proposals.max_height, cluster) - above
+        above = take(proposals.low[:, 2], cluster)
+        height = take(proposals.high[:, 2], cluster) - above
     flat = jnp.concatenate([rectangle[:, :2], jnp.zeros_like(rectangle[:, :1])], axis=1)
     bottom = above - height_above_ground(flat, heights.planes, heights.surface, config)
     total = jnp.where(chosen < score.shape[0], take(score, chosen) * late, 0)
@@ -98,7 +98,7 @@ def _look_around(
     settings = config.vehicles
     if not settings.surroundings:
         num_points = take(proposals.num_points, cluster).astype(jnp.float32)
-        return vehicles.cluster_alone(num_points, take(proposals.max_height, cluster))
+        return vehicles.cluster_alone(num_points, take(proposals.high[:, 2], cluster))
     return vehicles.count_points_around(
         rectangle,
         class_values(config, "count_max_height_m", label),

@@ -35,8 +35,8 @@ class Proposals:
     num_clusters: jax.Array  # ()
     num_first: jax.Array  # () those of the first map, which come first
     num_points: jax.Array  # (P,)
-    min_height: jax.Array  # (P,) m
-    max_height: jax.Array  # (P,) m
+    low: jax.Array  # (P, 3) m: least x, y and height
+    high: jax.Array  # (P, 3) m: greatest ones
     fitted: jax.Array  # (maps, O) whether a box is fitted to the point
     num_slab: jax.Array  # () points of the map that has most of those
     large: jax.Array  # (L,) clusters also tried as van and truck, P beyond
@@ -73,8 +73,8 @@ def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Proposals:
         num_clusters=jnp.sum(clusters.kept),
         num_first=clusters.kept[0],
         num_points=clusters.num_points,
-        min_height=clusters.min_height,
-        max_height=clusters.max_height,
+        low=clusters.low,
+        high=clusters.high,
         fitted=fitted[:, :num],
         num_slab=jnp.max(clusters.sum_by_map(num_fitted)),
         large=large,
@@ -183,9 +183,9 @@ def _find_clusters(
 
 def _large_clusters(clusters: Clusters, config: DetectorConfig) -> tuple[jax.Array, jax.Array]:
     settings = config.vehicles
-    stands = clusters.min_height < settings.large_clearance_m
+    stands = clusters.low[:, 2] < settings.large_clearance_m
     enough = clusters.num_points >= settings.large_min_points
-    return compact((clusters.max_height > settings.large_height_m) & stands & enough, settings.max_large)
+    return compact((clusters.high[:, 2] > settings.large_height_m) & stands & enough, settings.max_large)
 
 
 @jax.tree_util.register_dataclass
@@ -233,7 +233,7 @@ def _tall(proposals: Proposals, rectangles: Rectangles, config: DetectorConfig) 
     vehicles = config.vehicles
     rho = jnp.linalg.norm((rectangles.low + rectangles.high) / 2, axis=1)
     lowest = functools.reduce(jnp.minimum, [prior.min_height_m for prior in vehicles.classes])
-    return proposals.max_height + vehicles.top_grade * rho > lowest - LOWER_PART_M
+    return proposals.high[:, 2] + vehicles.top_grade * rho > lowest - LOWER_PART_M
 
 
 def longest_side(rectangles: Rectangles) -> jax.Array:
