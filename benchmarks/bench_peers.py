@@ -19,7 +19,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import cv2
-import jax
 import numpy as np
 
 import jaxbox
@@ -52,11 +51,11 @@ def jaxbox_chain(config: DetectorConfig) -> Chain:
 
     def run(xyz: np.ndarray) -> Answer:
         found = jaxbox.detect(PointCloud.from_numpy(xyz), config)
-        wanted = (found.center, found.size, found.yaw, found.score, found.valid, found.counts)
-        center, size, yaw, score, valid, counts = jax.device_get(wanted)
+        wanted = (found.center, found.size, found.yaw, found.score, found.valid)
+        center, size, yaw, score, valid = (np.asarray(array) for array in wanted)
         keep = valid & (score >= DEFAULT_CUT)
         boxes = np.column_stack([center[:, :2], size[:, :2], yaw])[keep]
-        return Answer(int(counts.obstacles), int(np.max(counts.clusters)), boxes)
+        return Answer(int(found.counts.obstacles), int(np.max(found.counts.clusters)), boxes)
 
     return run
 

@@ -117,7 +117,7 @@ def detect_each(
             jax.block_until_ready(jaxbox.detect(cloud, config))
             compiled.add(cloud.capacity)
             start = time.perf_counter()
-        detections = jax.device_get(jaxbox.detect(cloud, config))
+        detections = jaxbox.detect(cloud, config).on_host()
         yield name, detections, (time.perf_counter() - start) * 1e3
 
 

@@ -10,6 +10,9 @@ CAPACITY_BUCKETS: tuple[int, ...] = tuple(2**k for k in range(14, 21))
 ALIGNMENT_BYTES = 64
 """XLA takes a host array without a copy where its memory starts at a multiple of this."""
 
+BLOCK_ROWS = 8192
+"""Points copied at a time: few enough to be in the cache still when their last numbers are."""
+
 
 def fitting_capacity(num_points: int) -> int:
     """The smallest of `CAPACITY_BUCKETS` that holds so many points, or the largest bucket.
@@ -53,17 +56,18 @@ def fill_rows(xyz: np.ndarray, intensity: np.ndarray, rows: np.ndarray, padded: 
     if len(xyz) > len(rows):
         keep = _nearest(xyz, len(rows))
         xyz, intensity = xyz[keep], intensity[keep]
-    points = rows[: len(xyz)]
-    whole = _rows_of_four(xyz)
-    if whole is not None:
-        points[:] = whole
-    else:
-        # Column by column: NumPy copies rows of three numbers one row at a time.
-        for axis in range(3):
-            points[:, axis] = xyz[:, axis]
-    points[:, 3] = 1
+    source = _rows_of_four(xyz)
+    for first in range(0, len(xyz), BLOCK_ROWS):
+        block = slice(first, min(first + BLOCK_ROWS, len(xyz)))
+        if source is not None:
+            rows[block] = source[block]
+        else:
+            # Column by column: NumPy copies rows of three numbers one row at a time.
+            for axis in range(3):
+                rows[block, axis] = xyz[block, axis]
+        rows[block, 3] = 1
+        padded[block] = intensity[block]
     rows[len(xyz) :] = 0
-    padded[: len(xyz)] = intensity
     padded[len(xyz) :] = 0
 
 

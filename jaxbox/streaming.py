@@ -133,7 +133,8 @@ def _start(
 
 
 def _finish(started: StreamedSweep) -> StreamedSweep:
-    return dataclasses.replace(started, detections=jax.device_get(started.detections))
+    detections = None if started.detections is None else started.detections.on_host()
+    return dataclasses.replace(started, detections=detections)
 
 
 def _stream_here(

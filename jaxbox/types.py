@@ -359,6 +359,19 @@ class Detections:
     counts: Counts
     """Where every point went."""
 
+    def on_host(self) -> "Detections":
+        """The same in NumPy arrays, once they are computed.
+
+        On a CPU they are read-only views of JAX's own memory, where `jax.device_get` copies, and takes a
+        millisecond; from an accelerator all arrays come together.
+
+        Returns:
+          The detections, of one sweep or of a batch.
+        """
+        devices = self.status.devices() if isinstance(self.status, jax.Array) else ()
+        on_cpu = all(device.platform == "cpu" for device in devices)
+        return jax.tree.map(np.asarray, self) if on_cpu else jax.device_get(self)
+
     def raise_if_failed(self) -> None:
         """Raises where anything was dropped for want of capacity, naming the field to enlarge.
 

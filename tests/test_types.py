@@ -237,7 +237,7 @@ def rounds():
     """Runs with ever larger capacities, as the errors ask for, until nothing overflows."""
     cloud, config, runs = PointCloud.from_numpy(STREET, capacity=2**14), SMALL, []
     for _ in range(MAX_ROUNDS):
-        detections = jax.device_get(detect(cloud, config))
+        detections = detect(cloud, config).on_host()
         runs.append((config, detections))
         if not Status(int(detections.status)) & CAPACITY_BITS:
             break
@@ -245,6 +245,15 @@ def rounds():
             detections.raise_if_failed()
         config = enlarged(config, sizes_named(str(error.value)))
     return runs
+
+
+def test_detections_on_the_host_are_numpy_arrays_of_the_same_numbers(rounds):
+    config, detections = rounds[-1]
+    again = detect(PointCloud.from_numpy(STREET, capacity=2**14), config)
+    for host in (detections, detections.on_host()):
+        for ours, theirs in zip(jax.tree.leaves(host), jax.tree.leaves(jax.device_get(again)), strict=True):
+            assert isinstance(ours, np.ndarray)
+            np.testing.assert_array_equal(ours, theirs)
 
 
 def test_each_capacity_that_is_too_small_sets_its_bit(rounds):

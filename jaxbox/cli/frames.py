@@ -132,7 +132,7 @@ class FrameWork:
         padding_s = time.perf_counter() - start
         detections, detect_s = detector(cloud)
         start = time.perf_counter()
-        detections = jax.device_get(detections)
+        detections = detections.on_host()
         picture_error = self._draw(read, cloud, detections)
         return Frame(
             num_points=len(read.points[0]),

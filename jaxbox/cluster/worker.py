@@ -230,7 +230,7 @@ class PartitionWorker:
             # One sweep's arrays come to the host while the next are still computed.
             found = iter(detect_batch(clouds, self._task.config))
             for read in reads:
-                detections = None if read.cloud is None else jax.device_get(next(found))
+                detections = None if read.cloud is None else next(found).on_host()
                 report.detect_s += time.perf_counter() - start
                 yield read, detections
                 start = time.perf_counter()
