@@ -94,6 +94,7 @@ def extreme_points(
             # the point's index in one word. (Conversions to int32 vectorise, those to uint32 do not.)
             quantised = (across * (2**value_bits - 1)).astype(jnp.int32).astype(jnp.uint32)
             key = (quantised << index_bits) | (index.astype(jnp.uint32) + 1)
+            # Beyond the table where the point has no cluster.
             cell = jnp.where(slot < num_clusters, piece * num_clusters + slot, num_slices * num_clusters)
             new.append(before.at[cell].max(key, mode="drop"))
         return new

@@ -19,6 +19,7 @@ WORD_BITS = 32
 """Bits of a word of a set of flags."""
 
 BYTE_BITS = 8
+"""Flags that are compacted at a time."""
 
 _PLACES_OF_BYTE = np.array(
     [

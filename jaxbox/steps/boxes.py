@@ -85,11 +85,10 @@ def _hull_points(
     bounds = proposals.low[:, :2], proposals.high[:, :2]
     index = hull.extreme_points(cluster, row, num, obstacles.xy, *bounds, num_slices=config.hull.num_slices)
     x, y, count = trace_hulls(obstacles.xy, index, proposals.num_clusters, config)
-    start = jnp.arange(count.shape[0]) * config.hull.max_vertices
-    listed = jnp.minimum(count, config.hull.max_vertices)
-    return box.PointLists(x.T.reshape(-1), y.T.reshape(-1), start, listed, config.hull.max_vertices), jnp.max(
-        count
-    )
+    capacity = x.shape[0]
+    start, listed = jnp.arange(num_clusters) * capacity, jnp.minimum(count, capacity)
+    points = box.PointLists(x.T.reshape(-1), y.T.reshape(-1), start, listed, capacity)
+    return points, jnp.max(count)
 
 
 def trace_hulls(
