@@ -51,8 +51,8 @@ def time_whole(
 
     def boxes(sweep: tuple[np.ndarray, np.ndarray]) -> Any:
         found = jaxbox.detect(PointCloud.from_numpy(*sweep), config)
-        boxes = (found.center, found.size, found.yaw, found.score, found.label, found.valid)
-        return [np.asarray(array) for array in boxes]
+        wanted = (found.center, found.size, found.yaw, found.score, found.label, found.valid)
+        return [np.asarray(array) for array in wanted]
 
     for _ in range(passes):
         for sweep, cloud in zip(points, clouds, strict=True):

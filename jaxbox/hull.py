@@ -117,8 +117,8 @@ def convex_hulls(
     along the last axis: reductions along the other vectorise (XLA, CPU).
 
     Args:
-      x: (M, C) float32, m.
-      y: (M, C) float32, m.
+      x: (M, C) float32, m, finite where valid.
+      y: (M, C) float32, m, likewise.
       valid: (M, C) bool.
       max_vertices: static, H.
 
@@ -131,7 +131,8 @@ def convex_hulls(
     Reference: paper, section 3.3 and equation 6; oracle cv2.convexHull.
     """
     size = valid.shape[1]
-    x = jnp.where(valid, x, jnp.nan)
+    # Whatever absent points hold, the proof below does not see it.
+    x, y = jnp.where(valid, x, jnp.nan), jnp.where(valid, y, 0)
     chain_x, chain_y, count = _lower_hulls(*store([_both_ways(x), _both_ways(y)], y[0, 0] < jnp.inf))
     # A chain that ends where the other begins leaves that point to it.
     end = jnp.maximum(count - 1, 0), jnp.arange(2 * size)

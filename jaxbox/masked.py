@@ -103,6 +103,7 @@ def _compact_by_bytes(mask: jax.Array, *, capacity: int) -> tuple[jax.Array, jax
     Each writes eight indices, of which as many count as it has flags: the next byte writes over the others.
     """
     size = mask.shape[0]
+    # Whole pairs of bytes, as the loop takes two a step.
     flags = jnp.pad(mask, (0, -size % (2 * BYTE_BITS))).reshape(-1, BYTE_BITS)
     values = jnp.sum(jnp.where(flags, 1 << jnp.arange(BYTE_BITS), 0), axis=1).astype(jnp.uint8)
     places = jnp.asarray(_PLACES_OF_BYTE)

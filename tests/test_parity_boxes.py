@@ -118,6 +118,17 @@ def test_hulls_of_no_point_of_one_and_of_two_are_those_points():
     np.testing.assert_array_equal(vertices[2, :2], [[5, 7], [9, 8]])
 
 
+@pytest.mark.parametrize("garbage", [np.nan, np.inf, -np.inf])
+def test_what_absent_points_hold_does_not_reach_a_hull(garbage):
+    clouds = random_clouds(4, 10)
+    valid = np.arange(10) % 3 != 0  # the first point is absent
+    expected = trace_hulls(jnp.array(clouds[:, valid]), jnp.ones((4, valid.sum()), bool))
+    spoilt = np.where(valid[:, None], clouds, np.float32(garbage))
+    found = trace_hulls(jnp.array(spoilt), jnp.tile(valid, (4, 1)))
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
 def test_hulls_of_clusters_are_those_of_opencv(cases):
     for case in cases:
         points, count = parity.padded_points([case])
