@@ -32,7 +32,7 @@ LINK_CHUNK = 4096
 """Links between runs that are followed at a time; a sweep of 64 beams has some 1,000 to 14,000."""
 
 NUM_BOUNDS = 8
-"""Columns of the table of bounds, of which six are used: rows of 8 scatter twice as fast as rows of 6."""
+"""Columns of the table of bounds, of which six are used: a row of eight is a vector of the processor."""
 
 
 def warp_range(xy: jax.Array, *, start_m: jax.Array | float, growth: jax.Array | float) -> jax.Array:
@@ -356,40 +356,86 @@ class Statistics:
     count: jax.Array
     """(C, 2) int32: points, and those of them between the slab's heights."""
     upper: jax.Array
-    """(C, 8) float32, m: greatest x, y, height, -x, -y and -height."""
+    """(C, 8) float32, m: greatest x, y, height, -x, -y and -height; the last two are not used."""
 
 
-def no_statistics(max_components: int) -> Statistics:
-    """Statistics before the first point."""
-    return Statistics(
-        jnp.zeros((max_components, 2), jnp.int32), jnp.full((max_components, NUM_BOUNDS), -jnp.inf)
-    )
-
-
-def add_points(
-    before: Statistics, component: Sequence[jax.Array], xy: jax.Array, height: jax.Array, in_slab: jax.Array
+def find_statistics(
+    component: jax.Array,
+    num_points: jax.Array,
+    xy: jax.Array,
+    height: jax.Array,
+    in_slab: jax.Array,
+    *,
+    max_components: int,
 ) -> Statistics:
-    """Adds points to the statistics of their components.
+    """Counts the points of each component, and finds its bounds.
 
     Args:
-      before: of the points so far.
-      component: (N,) int32 of each map.
+      component: (maps, N) int32 of each point on each map.
+      num_points: () int32; only the first so many points count.
       xy: (N, 2) float32, m.
       height: (N,) float32, m, above the ground.
       in_slab: (N,) bool.
+      max_components: static, C.
 
     Returns:
-      Statistics of all.
+      The statistics of the components; anything of `NONE`.
     """
-    column = jnp.arange(NUM_BOUNDS)
-    sign = [(column == i).astype(jnp.float32) - (column == i + 3) for i in range(3)]
-    rows = xy[:, :1] * sign[0] + xy[:, 1:] * sign[1] + height[:, None] * sign[2]
-    ones = jnp.where(jnp.arange(2) == 0, 1, in_slab[:, None].astype(jnp.int32))
-    count, upper = before.count, before.upper
-    for on_map in component:
-        count = count.at[on_map].add(ones, mode="promise_in_bounds")
-        upper = upper.at[on_map].max(rows, mode="promise_in_bounds")
-    return Statistics(count, upper)
+    none = Statistics(
+        jnp.zeros((max_components, 2), jnp.int32), jnp.full((max_components, NUM_BOUNDS), -jnp.inf)
+    )
+    return jax.lax.platform_dependent(
+        none, component, num_points, xy, height, in_slab, cpu=_add_one_by_one, default=_add_at_once
+    )
+
+
+def _add_one_by_one(
+    statistics: Statistics,
+    component: jax.Array,
+    num_points: jax.Array,
+    xy: jax.Array,
+    height: jax.Array,
+    in_slab: jax.Array,
+) -> Statistics:
+    """Point after point: XLA compiles so small a loop to native code on the CPU, which adds a row at once.
+
+    Map after map: twice as much in a step would be beyond what it takes for small.
+    """
+
+    def add(on_map: int, i: jax.Array, before: Statistics) -> Statistics:
+        row = component[on_map, i]
+        counted = jnp.stack([jnp.int32(1), in_slab[i].astype(jnp.int32)])
+        x, y, z = xy[i, 0], xy[i, 1], height[i]
+        reached = jnp.stack([x, y, z, -x, -y, -z, -z, -z])
+        return Statistics(
+            jax.lax.dynamic_update_index_in_dim(before.count, before.count[row] + counted, row, 0),
+            jax.lax.dynamic_update_index_in_dim(
+                before.upper, jnp.maximum(before.upper[row], reached), row, 0
+            ),
+        )
+
+    for on_map in range(component.shape[0]):
+        statistics = jax.lax.fori_loop(0, num_points, functools.partial(add, on_map), statistics)
+    return statistics
+
+
+def _add_at_once(
+    statistics: Statistics,
+    component: jax.Array,
+    num_points: jax.Array,
+    xy: jax.Array,
+    height: jax.Array,
+    in_slab: jax.Array,
+) -> Statistics:
+    row = jnp.where(jnp.arange(height.shape[0]) < num_points, component, NONE)
+    counted = jnp.stack([jnp.ones_like(in_slab, jnp.int32), in_slab.astype(jnp.int32)], axis=1)
+    x, y, z = xy[:, 0], xy[:, 1], height
+    reached = jnp.stack([x, y, z, -x, -y, -z, -z, -z], axis=1)
+    shape = component.shape
+    return Statistics(
+        statistics.count.at[row].add(jnp.broadcast_to(counted, (*shape, 2)), mode="promise_in_bounds"),
+        statistics.upper.at[row].max(jnp.broadcast_to(reached, (*shape, NUM_BOUNDS)), mode="promise_in_bounds"),
+    )
 
 
 def select_clusters(

@@ -139,17 +139,22 @@ def _find_components(
 ) -> tuple[jax.Array, clustering.Statistics]:
     """The component of each point on each map, (maps, O), and the statistics of the components."""
 
-    def step(start: jax.Array, state: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
-        table, statistics = state
+    def step(start: jax.Array, table: jax.Array) -> jax.Array:
         found = [components.at(_on_map(cell, i, start)) for i in range(len(cell))]
         for i, component in enumerate(found):
             table = _store(table, i, start, component)
-        height = _chunk(obstacles.height, start)
-        slab = _in_slab(height, config)
-        return table, clustering.add_points(statistics, found, _chunk(obstacles.xy, start), height, slab)
+        return table
 
-    statistics = clustering.no_statistics(components.of_run.shape[0])
-    return _fold_chunks(step, (jnp.zeros_like(cell), statistics), obstacles)
+    component = _fold_chunks(step, jnp.zeros_like(cell), obstacles)
+    statistics = clustering.find_statistics(
+        component,
+        jnp.minimum(obstacles.count, obstacles.height.shape[0]),
+        obstacles.xy,
+        obstacles.height,
+        _in_slab(obstacles.height, config),
+        max_components=components.of_run.shape[0],
+    )
+    return component, statistics
 
 
 def _in_slab(height: jax.Array, config: DetectorConfig) -> jax.Array:
