@@ -405,8 +405,7 @@ def _add_one_by_one(
     def add(on_map: int, i: jax.Array, before: Statistics) -> Statistics:
         row = component[on_map, i]
         counted = jnp.stack([jnp.int32(1), in_slab[i].astype(jnp.int32)])
-        x, y, z = xy[i, 0], xy[i, 1], height[i]
-        reached = jnp.stack([x, y, z, -x, -y, -z, -z, -z])
+        reached = _reach(xy[i, 0], xy[i, 1], height[i])
         return Statistics(
             jax.lax.dynamic_update_index_in_dim(before.count, before.count[row] + counted, row, 0),
             jax.lax.dynamic_update_index_in_dim(
@@ -429,13 +428,18 @@ def _add_at_once(
 ) -> Statistics:
     row = jnp.where(jnp.arange(height.shape[0]) < num_points, component, NONE)
     counted = jnp.stack([jnp.ones_like(in_slab, jnp.int32), in_slab.astype(jnp.int32)], axis=1)
-    x, y, z = xy[:, 0], xy[:, 1], height
-    reached = jnp.stack([x, y, z, -x, -y, -z, -z, -z], axis=1)
-    shape = component.shape
+    reached = _reach(xy[:, 0], xy[:, 1], height)
+    counted, reached = (jnp.broadcast_to(a, (*row.shape, a.shape[1])) for a in (counted, reached))
     return Statistics(
-        statistics.count.at[row].add(jnp.broadcast_to(counted, (*shape, 2)), mode="promise_in_bounds"),
-        statistics.upper.at[row].max(jnp.broadcast_to(reached, (*shape, NUM_BOUNDS)), mode="promise_in_bounds"),
+        statistics.count.at[row].add(counted, mode="promise_in_bounds"),
+        statistics.upper.at[row].max(reached, mode="promise_in_bounds"),
     )
+
+
+def _reach(x: jax.Array, y: jax.Array, height: jax.Array) -> jax.Array:
+    """(..., 8) what a point adds to `Statistics.upper`."""
+    columns = [x, y, height, -x, -y, -height]
+    return jnp.stack(columns + columns[-1:] * (NUM_BOUNDS - len(columns)), axis=-1)
 
 
 def select_clusters(

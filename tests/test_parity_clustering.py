@@ -31,7 +31,9 @@ def label_cells(cells, *, row, max_runs):
 
 @functools.partial(jax.jit, static_argnames="max_clusters")
 def select_clusters(component, xy, height, in_slab, first, *, max_clusters, **gates):
-    statistics = clustering.add_points(clustering.no_statistics(MAX_RUNS), component, xy, height, in_slab)
+    statistics = clustering.find_statistics(
+        component, height.size, xy, height, in_slab, max_components=MAX_RUNS
+    )
     return clustering.select_clusters(statistics, first, max_clusters=max_clusters, **gates)
 
 
@@ -52,6 +54,24 @@ def members_of(case, component_map):
     height = case.obstacles.height
     member = (height > component_map.min_height_m) & (height < component_map.max_height_m)
     return case.obstacles.xyz[member, :2].astype(np.float32), height[member].astype(np.float32)
+
+
+@pytest.mark.parametrize("platform", ["cpu", "default"])
+@pytest.mark.parametrize("num_points", [0, 1, 700, 1000])
+def test_statistics_are_those_of_the_first_points_on_every_platform(platform, num_points, monkeypatch):
+    rng = np.random.default_rng(num_points)
+    component = rng.integers(0, 40, (2, 1000), np.int32)
+    component[1] += 40
+    xyz, in_slab = rng.normal(size=(1000, 3)).astype(np.float32), rng.random(1000) < 0.5
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[platform](*args))
+    points = component, jnp.int32(num_points), xyz[:, :2], xyz[:, 2], in_slab
+    statistics = clustering.find_statistics(*map(jnp.asarray, points), max_components=81)
+    for i in range(1, 81):
+        member = (component == i)[:, :num_points].any(axis=0)
+        own = xyz[:num_points][member]
+        assert statistics.count[i].tolist() == [len(own), in_slab[:num_points][member].sum()]
+        bounds = np.concatenate([own.max(axis=0, initial=-np.inf), (-own).max(axis=0, initial=-np.inf)])
+        np.testing.assert_array_equal(statistics.upper[i, :6], bounds)
 
 
 def test_warped_points_are_those_of_the_reference(cases):
@@ -158,7 +178,7 @@ def test_clusters_that_pass_the_gates_are_exactly_those_of_the_reference(cases, 
         slot, count = reference.keep_clusters(xy, component, **GATES)
         in_slab = np.arange(len(xy)) % 3 == 0
         clusters = select_clusters(
-            [parity.pad(1 + component, parity.MAX_OBSTACLES)],
+            parity.pad(1 + component, parity.MAX_OBSTACLES)[None],
             parity.pad(xy, parity.MAX_OBSTACLES),
             parity.pad(height, parity.MAX_OBSTACLES),
             parity.pad(in_slab, parity.MAX_OBSTACLES),
@@ -190,7 +210,7 @@ def test_the_lists_of_the_maps_join_without_gaps_and_end_at_their_capacities():
         ((2, 1, 3), {1: 0, 3: 1, 5: 2, 8: 3, 9: 4}),
     ):
         clusters = select_clusters(
-            [component], xy, np.zeros(11), np.ones(11, bool), np.array([1, 5, 7, 10]), max_clusters=sizes,
+            component[None], xy, np.zeros(11), np.ones(11, bool), np.array([1, 5, 7, 10]), max_clusters=sizes,
             min_points=1.0, min_extent_m=0.0, max_extent_m=12.0,
         )  # fmt: skip
         none = sum(sizes)

@@ -146,9 +146,10 @@ def _find_components(
         return table
 
     component = _fold_chunks(step, jnp.zeros_like(cell), obstacles)
+    size = obstacles.height.shape[0]
     statistics = clustering.find_statistics(
-        component,
-        jnp.minimum(obstacles.count, obstacles.height.shape[0]),
+        component[:, :size],
+        jnp.minimum(obstacles.count, size),
         obstacles.xy,
         obstacles.height,
         _in_slab(obstacles.height, config),
