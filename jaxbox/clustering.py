@@ -183,7 +183,8 @@ class Components:
 
     def at(self, cell: jax.Array) -> jax.Array:
         """Component of occupied cells: `NONE` at that cell, and in runs beyond the capacity."""
-        return take(self.of_run, _run_at(self.starts, self.runs_before, cell), NONE)
+        place = _place(cell, self.starts.shape[1])
+        return take(self.of_run, _run_at(self.starts, self.runs_before, place), NONE)
 
 
 def label_components(flags: jax.Array, row: CellRow, *, max_runs: int) -> Components:
@@ -218,14 +219,20 @@ def label_components(flags: jax.Array, row: CellRow, *, max_runs: int) -> Compon
     itself = jnp.arange(max_runs, dtype=jnp.int32)
     present = (itself > NONE) & (itself < num_runs)
 
-    def link(bits: jax.Array, at: jax.Array) -> jax.Array:
-        return jnp.where(present & _is_set(bits, at), _run_at(starts, runs_before, at), itself)
-
     # Two runs touch first where the one on the later line starts: then the other holds that cell of its line
     # or the one before; or one cell before the other starts: then the one on the later line holds that.
     back = _by_map(row, cell)
-    lower = [link(words | after, cell - b) for b in back]
-    upper = [link(words, cell + b - 1) for b in back]
+    # Stored, since what a look-up has to work out first does not vectorise.
+    place = functools.partial(_place, num_strips=row.num_strips)
+    before, behind = store(
+        ([place(cell - b) for b in back], [place(cell + b - 1) for b in back]), num_runs >= 0
+    )
+
+    def link(bits: jax.Array, at: Place) -> jax.Array:
+        return jnp.where(present & _is_set(bits, at), _run_at(starts, runs_before, at), itself)
+
+    lower = [link(words | after, at) for at in before]
+    upper = [link(words, at) for at in behind]
     parent = _connect(lower[0], [*lower[1:], *upper])
     number = prefix_sum((parent == itself) & (itself < num_runs)) - 1
     first_run = jnp.append(runs_before[0, jnp.array(row.starts[:-1]) // STRIP], num_runs)
@@ -263,22 +270,25 @@ def _population(words: jax.Array) -> jax.Array:
     return jax.lax.population_count(words).astype(jnp.int32)
 
 
-def _place(cell: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Word, strip and bit of a cell."""
-    bit = cell & (WORD_BITS - 1)
-    return (cell & (STRIP - 1)) >> WORD_SHIFT, cell >> STRIP_SHIFT, bit.astype(jnp.uint32)
+Place = tuple[jax.Array, jax.Array]
+"""Where the words (R, S), row after row, hold a cell: in which of them, and as which bit."""
 
 
-def _is_set(words: jax.Array, cell: jax.Array) -> jax.Array:
-    word, strip, bit = _place(cell)
-    return lookup(words, word, strip) >> bit & 1 == 1
+def _place(cell: jax.Array, num_strips: int) -> Place:
+    word, strip = (cell & (STRIP - 1)) >> WORD_SHIFT, cell >> STRIP_SHIFT
+    return word * num_strips + strip, (cell & (WORD_BITS - 1)).astype(jnp.uint32)
 
 
-def _run_at(starts: jax.Array, runs_before: jax.Array, cell: jax.Array) -> jax.Array:
+def _is_set(words: jax.Array, place: Place) -> jax.Array:
+    word, bit = place
+    return lookup(words.reshape(-1), word) >> bit & 1 == 1
+
+
+def _run_at(starts: jax.Array, runs_before: jax.Array, place: Place) -> jax.Array:
     """The last run that starts at a cell or before it."""
-    word, strip, bit = _place(cell)
-    up_to = lookup(starts, word, strip) & ((jnp.uint32(2) << bit) - 1)
-    return lookup(runs_before, word, strip) + _population(up_to) - 1
+    word, bit = place
+    up_to = lookup(starts.reshape(-1), word) & ((jnp.uint32(2) << bit) - 1)
+    return lookup(runs_before.reshape(-1), word) + _population(up_to) - 1
 
 
 def _starting_cells(starts: jax.Array, runs_before: jax.Array, size: int) -> jax.Array:
@@ -290,9 +300,9 @@ def _starting_cells(starts: jax.Array, runs_before: jax.Array, size: int) -> jax
     # The first run of each word knows where the word begins; its other runs come next.
     for step in (1, 2, 4, 8):
         cell = jnp.maximum(cell, jnp.pad(cell, (step, 0))[:size])
-    word, strip, _ = _place(cell)
-    rank = jnp.arange(size) - lookup(runs_before, word, strip)
-    bits = lookup(starts, word, strip)
+    word, _ = _place(cell, strips)
+    rank = jnp.arange(size) - lookup(runs_before.reshape(-1), word)
+    bits = lookup(starts.reshape(-1), word)
     for k in range(MAX_STARTS - 1):
         bits = jnp.where(rank > k, bits & (bits - 1), bits)
     return cell + _population((bits & -bits) - 1)
