@@ -3,8 +3,9 @@
     python -m benchmarks.bench_peers [--quick] [--only jaxbox reference] [--json FILE]
 
 Host array in, host boxes out. On every sweep each chain runs once before the next sweep, so that a slow
-minute of the machine is everybody's. Those that are not slow first rest, and take the sweep before, untimed:
-threads that another chain has left spinning, and what it has left in the caches, are not their own time.
+minute of the machine is everybody's. Those that are not slow first take the sweep before for a tenth of a
+second, untimed: threads that another chain has left spinning, what it has left in the caches, and what a rest
+would cost, are not their own time.
 A faster but worse answer shows: what a chain kept, how many clusters and boxes it made of it, and which share
 of the labelled cars it found. Compiling and reading are not timed.
 A peer that is not installed is named with the command that installs it.
@@ -36,8 +37,8 @@ ROUNDS, QUICK_ROUNDS = 3, 2
 """Times that all sweeps are gone through; slow peers run in the first only."""
 SLOW_MS = 400.0
 """A chain that takes longer for its first sweep is slow."""
-REST_S = 0.2
-"""Threads of linear algebra libraries spin for a tenth of a second after their last work."""
+WARM_UP_S = 0.1
+"""So long do threads of linear algebra libraries spin after their last work."""
 
 MIN_LABEL_POINTS, MAX_OCCLUSION = 30, 1
 """Cars that everybody should find."""
@@ -138,6 +139,12 @@ def time_chain(chain: Chain, xyz: np.ndarray) -> tuple[float, Answer]:
     return (chain.spent_ms if isinstance(chain, PclProcess) else spent_ms), answer
 
 
+def warm_up(chain: Chain, xyz: np.ndarray) -> None:
+    end = time.perf_counter() + WARM_UP_S
+    while time.perf_counter() < end:
+        chain(xyz)
+
+
 def run_all(chains: Mapping[str, Chain], frames: Sequence[Frame], rounds: int) -> dict[str, dict[str, Any]]:
     """Times and answers of every chain, sweep by sweep."""
     clouds = [in_region(frame) for frame in frames]
@@ -153,8 +160,7 @@ def run_all(chains: Mapping[str, Chain], frames: Sequence[Frame], rounds: int) -
                 if turn and is_slow:
                     continue
                 if not is_slow:
-                    time.sleep(REST_S)
-                    time_chain(chain, before)
+                    warm_up(chain, before)
                 spent_ms, answer = time_chain(chain, xyz)
                 spent[name].append(spent_ms)
                 if not turn:
