@@ -409,7 +409,7 @@ def _add_one_by_one(
 ) -> Statistics:
     """Point after point: XLA compiles so small a loop to native code on the CPU, which adds a row at once.
 
-    Map after map: twice as much in a step would be beyond what it takes for small.
+    Map after map, so that a step is small however many there are.
     """
 
     def add(on_map: int, i: jax.Array, before: Statistics) -> Statistics:
