@@ -400,17 +400,13 @@ def find_statistics(
 
 
 def _add_one_by_one(
-    statistics: Statistics,
-    component: jax.Array,
-    num_points: jax.Array,
-    xy: jax.Array,
-    height: jax.Array,
-    in_slab: jax.Array,
+    statistics: Statistics, component: jax.Array, num_points: jax.Array, *points: jax.Array
 ) -> Statistics:
     """Point after point: XLA compiles so small a loop to native code on the CPU, which adds a row at once.
 
     Map after map, so that a step is small however many there are.
     """
+    xy, height, in_slab = points
 
     def add(on_map: int, i: jax.Array, before: Statistics) -> Statistics:
         row = component[on_map, i]
@@ -429,13 +425,9 @@ def _add_one_by_one(
 
 
 def _add_at_once(
-    statistics: Statistics,
-    component: jax.Array,
-    num_points: jax.Array,
-    xy: jax.Array,
-    height: jax.Array,
-    in_slab: jax.Array,
+    statistics: Statistics, component: jax.Array, num_points: jax.Array, *points: jax.Array
 ) -> Statistics:
+    xy, height, in_slab = points
     row = jnp.where(jnp.arange(height.shape[0]) < num_points, component, NONE)
     counted = jnp.stack([jnp.ones_like(in_slab, jnp.int32), in_slab.astype(jnp.int32)], axis=1)
     reached = _reach(xy[:, 0], xy[:, 1], height)
