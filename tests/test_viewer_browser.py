@@ -12,7 +12,6 @@ from jaxbox import DetectorConfig, PointCloud, detect, io
 from jaxbox.settings import settings_from_toml
 from jaxbox.viewer import View, Wanted, open_viewer
 from jaxbox.viz import BoxSet
-from jaxbox.viz.colors import ESTIMATE
 
 pytestmark = pytest.mark.browser
 
@@ -59,9 +58,10 @@ def num_boxes(seed, *, min_score=SHOWN, config=None):
 
 
 def box_pixels(visit):
-    """Pixels of the 3D view in the colour of the boxes."""
-    view = visit.picture()[: VIEW_PX[0], : VIEW_PX[1]].astype(int)
-    return int((np.abs(view - np.array(ESTIMATE)).max(axis=2) < 40).sum())
+    """Pixels of the 3D view in the colour of the boxes, `ESTIMATE`."""
+    red, green, blue = np.moveaxis(visit.picture()[: VIEW_PX[0], : VIEW_PX[1]].astype(int), 2, 0)
+    # By their hue: without a graphics card thin lines are blended with what lies behind them.
+    return int(np.sum((red > 180) & (red - blue > 90) & (red >= green) & (green > 0.6 * red)))
 
 
 def test_the_page_shows_the_boxes(visit):
@@ -73,7 +73,9 @@ def test_the_page_shows_the_boxes(visit):
     visit.tab("View")
     # Browns and blues: nothing but the boxes is yellow.
     visit.choose("colour by", "ground")
-    visit.wait(lambda: box_pixels(visit) > 300)
+    # Which of two lines in one place is drawn last is anybody's guess.
+    visit.page.get_by_label("labelled boxes", exact=True).uncheck()
+    visit.wait(lambda: box_pixels(visit) > 500)
     visit.page.get_by_label("boxes", exact=True).uncheck()
     visit.wait(lambda: box_pixels(visit) < 100)
 
