@@ -10,7 +10,6 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.masked import WORD_BITS, compact, fold_rows, lookup, prefix_sum, store, take
-from jaxbox.types import Clusters
 
 STRIP_WORDS = 32
 """R, words of a strip of consecutive cells. The strips lie side by side in tables (R, S), so that sums along
@@ -30,9 +29,6 @@ NONE = 0
 
 LINK_CHUNK = 4096
 """Links between runs that are followed at a time; a sweep of 64 beams has some 1,000 to 14,000."""
-
-NUM_BOUNDS = 8
-"""Columns of the table of bounds, of which six are used: a row of eight is a vector of the processor."""
 
 
 def warp_range(xy: jax.Array, *, start_m: jax.Array | float, growth: jax.Array | float) -> jax.Array:
@@ -281,14 +277,14 @@ def _place(cell: jax.Array, num_strips: int) -> Place:
 
 def _is_set(words: jax.Array, place: Place) -> jax.Array:
     word, bit = place
-    return lookup(words.reshape(-1), word) >> bit & 1 == 1
+    return jnp.take(words, word, mode="clip") >> bit & 1 == 1
 
 
 def _run_at(starts: jax.Array, runs_before: jax.Array, place: Place) -> jax.Array:
     """The last run that starts at a cell or before it."""
     word, bit = place
-    up_to = lookup(starts.reshape(-1), word) & ((jnp.uint32(2) << bit) - 1)
-    return lookup(runs_before.reshape(-1), word) + _population(up_to) - 1
+    up_to = jnp.take(starts, word, mode="clip") & ((jnp.uint32(2) << bit) - 1)
+    return jnp.take(runs_before, word, mode="clip") + _population(up_to) - 1
 
 
 def _starting_cells(starts: jax.Array, runs_before: jax.Array, size: int) -> jax.Array:
@@ -301,8 +297,8 @@ def _starting_cells(starts: jax.Array, runs_before: jax.Array, size: int) -> jax
     for step in (1, 2, 4, 8):
         cell = jnp.maximum(cell, jnp.pad(cell, (step, 0))[:size])
     word, _ = _place(cell, strips)
-    rank = jnp.arange(size) - lookup(runs_before.reshape(-1), word)
-    bits = lookup(starts.reshape(-1), word)
+    rank = jnp.arange(size) - jnp.take(runs_before, word, mode="clip")
+    bits = jnp.take(starts, word, mode="clip")
     for k in range(MAX_STARTS - 1):
         bits = jnp.where(rank > k, bits & (bits - 1), bits)
     return cell + _population((bits & -bits) - 1)
@@ -356,141 +352,3 @@ def _jump(parent: jax.Array) -> jax.Array:
         return higher, jnp.any(higher != parent)
 
     return jax.lax.while_loop(lambda state: state[1], jump, (parent, jnp.bool_(True)))[0]
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Statistics:
-    """What the size gates ask of each component."""
-
-    count: jax.Array
-    """(C, 2) int32: points, and those of them between the slab's heights."""
-    upper: jax.Array
-    """(C, 8) float32, m: greatest x, y, height, -x, -y and -height; the last two are not used."""
-
-
-def find_statistics(
-    component: jax.Array,
-    num_points: jax.Array,
-    xy: jax.Array,
-    height: jax.Array,
-    in_slab: jax.Array,
-    *,
-    max_components: int,
-) -> Statistics:
-    """Counts the points of each component, and finds its bounds.
-
-    Args:
-      component: (maps, N) int32 of each point on each map.
-      num_points: () int32; only the first so many points count.
-      xy: (N, 2) float32, m.
-      height: (N,) float32, m, above the ground.
-      in_slab: (N,) bool.
-      max_components: static, C.
-
-    Returns:
-      The statistics of the components; anything of `NONE`.
-    """
-    none = Statistics(
-        jnp.zeros((max_components, 2), jnp.int32), jnp.full((max_components, NUM_BOUNDS), -jnp.inf)
-    )
-    return jax.lax.platform_dependent(
-        none, component, num_points, xy, height, in_slab, cpu=_add_one_by_one, default=_add_at_once
-    )
-
-
-def _add_one_by_one(
-    statistics: Statistics, component: jax.Array, num_points: jax.Array, *points: jax.Array
-) -> Statistics:
-    """Point after point: XLA compiles so small a loop to native code on the CPU, which adds a row at once.
-
-    Map after map, so that a step is small however many there are.
-    """
-    xy, height, in_slab = points
-
-    def add(on_map: int, i: jax.Array, before: Statistics) -> Statistics:
-        row = component[on_map, i]
-        counted = jnp.stack([jnp.int32(1), in_slab[i].astype(jnp.int32)])
-        reached = _reach(xy[i, 0], xy[i, 1], height[i])
-        return Statistics(
-            jax.lax.dynamic_update_index_in_dim(before.count, before.count[row] + counted, row, 0),
-            jax.lax.dynamic_update_index_in_dim(
-                before.upper, jnp.maximum(before.upper[row], reached), row, 0
-            ),
-        )
-
-    for on_map in range(component.shape[0]):
-        statistics = jax.lax.fori_loop(0, num_points, functools.partial(add, on_map), statistics)
-    return statistics
-
-
-def _add_at_once(
-    statistics: Statistics, component: jax.Array, num_points: jax.Array, *points: jax.Array
-) -> Statistics:
-    xy, height, in_slab = points
-    row = jnp.where(jnp.arange(height.shape[0]) < num_points, component, NONE)
-    counted = jnp.stack([jnp.ones_like(in_slab, jnp.int32), in_slab.astype(jnp.int32)], axis=1)
-    reached = _reach(xy[:, 0], xy[:, 1], height)
-    counted, reached = (jnp.broadcast_to(a, (*row.shape, a.shape[1])) for a in (counted, reached))
-    return Statistics(
-        statistics.count.at[row].add(counted, mode="promise_in_bounds"),
-        statistics.upper.at[row].max(reached, mode="promise_in_bounds"),
-    )
-
-
-def _reach(x: jax.Array, y: jax.Array, height: jax.Array) -> jax.Array:
-    """(..., 8) what a point adds to `Statistics.upper`."""
-    columns = [x, y, height, -x, -y, -height]
-    return jnp.stack(columns + columns[-1:] * (NUM_BOUNDS - len(columns)), axis=-1)
-
-
-def select_clusters(
-    statistics: Statistics,
-    first: jax.Array,
-    *,
-    max_clusters: Sequence[int],
-    min_points: jax.Array | float,
-    min_extent_m: jax.Array | float,
-    max_extent_m: jax.Array | float,
-) -> Clusters:
-    """Keeps the components that may be a vehicle: enough points, not too short, and not too long.
-
-    Args:
-      statistics: of the C components.
-      first: (maps + 1,) int32, see `Components`.
-      max_clusters: static, of each map; the clusters beyond it are left out.
-      min_points: least number of points.
-      min_extent_m: least diagonal of the extents along x and y, m: no rectangle has a longer side.
-      max_extent_m: greatest extent along x and along y, m.
-
-    Returns:
-      The clusters, in the order of the components.
-    """
-    capacity = sum(max_clusters)
-    upper, num_points = statistics.upper, statistics.count[:, 0]
-    component = jnp.arange(num_points.shape[0])
-    keep = (num_points >= jnp.maximum(min_points, 1)) & (component >= first[0]) & (component < first[-1])
-    extent_x, extent_y = upper[:, 0] + upper[:, 3], upper[:, 1] + upper[:, 4]
-    keep = keep & (jnp.maximum(extent_x, extent_y) <= max_extent_m)
-    keep = keep & (extent_x**2 + extent_y**2 >= min_extent_m**2)
-    keep, order = store((keep, prefix_sum(keep)), first[0] >= 0)
-    end = lookup(order, first - 1)
-    found = end[1:] - end[:-1]
-    kept = jnp.minimum(found, jnp.array(max_clusters))
-    # The lists of the maps join without gaps.
-    row = jnp.full_like(order, capacity)
-    for i, size in enumerate(max_clusters):
-        place = order - end[i]
-        listed = keep & (place > 0) & (place <= size)
-        row = jnp.where(listed, place - 1 + jnp.sum(kept[:i]), row)
-    member = jnp.full(capacity, num_points.shape[0]).at[row].set(component, mode="drop")
-    upper = take(upper, member)
-    return Clusters(
-        row=row,
-        num_points=take(num_points, member),
-        num_slab=take(statistics.count[:, 1], member),
-        low=-upper[:, 3:6],
-        high=upper[:, :3],
-        found=found,
-        kept=kept,
-    )

@@ -33,8 +33,8 @@ FOUNDATION = {
     "sensors",
 }
 STAGES = {
-    "filtering", "ground", "clustering", "hull", "box", "descriptors", "evidence", "completion", "vehicles",
-    "projection",
+    "filtering", "ground", "clustering", "selection", "hull", "box", "descriptors", "evidence", "completion",
+    "vehicles", "projection",
 }  # fmt: skip
 WIRING = {"steps", "detector"}
 MANY = {"batching", "streaming", "workers"}

@@ -9,7 +9,7 @@ import parity
 import pytest
 from scipy import ndimage
 
-from jaxbox import box, clustering, reference
+from jaxbox import box, clustering, reference, selection
 from jaxbox.config import ComponentMap, DetectorConfig
 from jaxbox.reference.clusters import NO_CLUSTER
 
@@ -31,10 +31,10 @@ def label_cells(cells, *, row, max_runs):
 
 @functools.partial(jax.jit, static_argnames="max_clusters")
 def select_clusters(component, xy, height, in_slab, first, *, max_clusters, **gates):
-    statistics = clustering.find_statistics(
+    statistics = selection.find_statistics(
         component, height.size, xy, height, in_slab, max_components=MAX_RUNS
     )
-    return clustering.select_clusters(statistics, first, max_clusters=max_clusters, **gates)
+    return selection.select_clusters(statistics, first, max_clusters=max_clusters, **gates)
 
 
 list_points = jax.jit(box.list_points, static_argnames=("num_clusters", "max_points"))
@@ -65,8 +65,8 @@ def test_statistics_are_those_of_the_first_points_on_every_platform(platform, nu
     xyz, in_slab = rng.normal(size=(1000, 3)).astype(np.float32), rng.random(1000) < 0.5
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[platform](*args))
     points = component, jnp.int32(num_points), xyz[:, :2], xyz[:, 2], in_slab
-    statistics = clustering.find_statistics(*map(jnp.asarray, points), max_components=81)
-    for i in range(1, 81):
+    statistics = selection.find_statistics(*map(jnp.asarray, points), max_components=81)
+    for i in range(81):
         member = (component == i)[:, :num_points].any(axis=0)
         own = xyz[:num_points][member]
         assert statistics.count[i].tolist() == [len(own), in_slab[:num_points][member].sum()]

@@ -2,6 +2,7 @@
 
 import threading
 
+import cv2
 import numpy as np
 import pytest
 from browser import LOOPBACK, WAIT_S, chromium
@@ -12,6 +13,7 @@ from jaxbox import DetectorConfig, PointCloud, detect, io
 from jaxbox.settings import settings_from_toml
 from jaxbox.viewer import View, Wanted, open_viewer
 from jaxbox.viz import BoxSet
+from jaxbox.viz.colors import ESTIMATE
 
 pytestmark = pytest.mark.browser
 
@@ -57,11 +59,18 @@ def num_boxes(seed, *, min_score=SHOWN, config=None):
     return len(BoxSet.from_detections(detections, min_score=min_score))
 
 
+def hue_saturation_value(picture):
+    """(..., 3) int of an RGB picture: hue as half its degrees."""
+    return cv2.cvtColor(np.asarray(picture, np.uint8), cv2.COLOR_RGB2HSV).astype(int)
+
+
 def box_pixels(visit):
-    """Pixels of the 3D view in the colour of the boxes, `ESTIMATE`."""
-    red, green, blue = np.moveaxis(visit.picture()[: VIEW_PX[0], : VIEW_PX[1]].astype(int), 2, 0)
-    # By their hue: without a graphics card thin lines are blended with what lies behind them.
-    return int(np.sum((red > 180) & (red - blue > 90) & (red >= green) & (green > 0.6 * red)))
+    """Pixels of the 3D view in the hue of the boxes: where no graphics card draws, thin lines are blended."""
+    hue, saturation, value = np.moveaxis(
+        hue_saturation_value(visit.picture()[: VIEW_PX[0], : VIEW_PX[1]]), 2, 0
+    )
+    boxes = hue_saturation_value([[ESTIMATE]])[0, 0, 0]
+    return int(np.sum((np.abs(hue - boxes) <= 5) & (saturation > 110) & (value > 180)))
 
 
 def test_the_page_shows_the_boxes(visit):

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxbox import clustering
+from jaxbox import clustering, selection
 from jaxbox.class_priors import ClassPrior
 from jaxbox.config import DetectorConfig
 from jaxbox.masked import apart, compact, lookup, take
@@ -51,8 +51,17 @@ def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Proposals:
     )
     cell, flags = _find_cells(obstacles, cells, config)
     components = clustering.label_components(flags, cells, max_runs=sum(m.max_cells for m in maps))
-    component, statistics = _find_components(obstacles, cell, components, config)
-    clusters = clustering.select_clusters(
+    component = _find_components(obstacles, cell, components)
+    num = obstacles.height.shape[0]
+    statistics = selection.find_statistics(
+        component[:, :num],
+        jnp.minimum(obstacles.count, num),
+        obstacles.xy,
+        obstacles.height,
+        _in_slab(obstacles.height, config),
+        max_components=components.of_run.shape[0],
+    )
+    clusters = selection.select_clusters(
         statistics,
         components.first,
         max_clusters=[m.max_clusters for m in maps],
@@ -64,7 +73,6 @@ def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Proposals:
     cluster, fitted = _find_clusters(obstacles, component, clusters.row, all_fitted, config)
     num_fitted = jnp.where(all_fitted, clusters.num_points, clusters.num_slab)
     large, num_large = _large_clusters(clusters, config)
-    num = obstacles.height.shape[0]
     return Proposals(
         component=component[0, :num] - 1,
         cluster=cluster[:, :num],
@@ -134,28 +142,15 @@ def _find_cells(
     return _fold_chunks(step, (table, jnp.zeros(cells.num_flags, jnp.uint8)), obstacles)
 
 
-def _find_components(
-    obstacles: Obstacles, cell: jax.Array, components: clustering.Components, config: DetectorConfig
-) -> tuple[jax.Array, clustering.Statistics]:
-    """The component of each point on each map, (maps, O), and the statistics of the components."""
+def _find_components(obstacles: Obstacles, cell: jax.Array, components: clustering.Components) -> jax.Array:
+    """The component of each point on each map, (maps, O)."""
 
     def step(start: jax.Array, table: jax.Array) -> jax.Array:
-        found = [components.at(_on_map(cell, i, start)) for i in range(len(cell))]
-        for i, component in enumerate(found):
-            table = _store(table, i, start, component)
+        for i in range(len(cell)):
+            table = _store(table, i, start, components.at(_on_map(cell, i, start)))
         return table
 
-    component = _fold_chunks(step, jnp.zeros_like(cell), obstacles)
-    size = obstacles.height.shape[0]
-    statistics = clustering.find_statistics(
-        component[:, :size],
-        jnp.minimum(obstacles.count, size),
-        obstacles.xy,
-        obstacles.height,
-        _in_slab(obstacles.height, config),
-        max_components=components.of_run.shape[0],
-    )
-    return component, statistics
+    return _fold_chunks(step, jnp.zeros_like(cell), obstacles)
 
 
 def _in_slab(height: jax.Array, config: DetectorConfig) -> jax.Array:
