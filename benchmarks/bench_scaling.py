@@ -39,7 +39,6 @@ STREAMED, QUICK_STREAMED = 160, 24
 """Sweeps of a measurement of throughput."""
 ROUNDS = 5
 """Measurements of throughput of each kind."""
-ONE_CORE = "one core"
 TURN_DEG = 17.3
 """Between sweeps that are laid over each other."""
 
@@ -116,33 +115,38 @@ def repeated(sweeps: Sequence[Sweep], count: int) -> Iterator[Sweep]:
     return itertools.islice(itertools.cycle(sweeps), count)
 
 
-def use(cores: int, devices: int) -> None:
-    """Holds this process to so many cores and devices, which JAX asks for when it starts."""
+def use(cores: int, devices: int) -> Sequence[Any]:
+    """Holds this process to so many cores, and to so many devices, which it returns."""
     os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:cores]))
+    # Devices of a CPU: as many as JAX is asked for when it starts.
     jax.config.update("jax_num_cpu_devices", devices)
+    return jax.local_devices()[:devices]
 
 
-def rate_of_batch(sweeps: Sequence[Sweep], preset: str, count: int, cores: int, devices: int) -> float:
+def rate_of_batch(sweeps: Sequence[Sweep], preset: str, count: int, cores: int, num_devices: int) -> float:
     """Sweeps a second of `detect_batch`, from arrays on the device, with so many cores and devices."""
-    use(cores, devices)
+    devices = use(cores, num_devices)
     config = DetectorConfig.presets()[preset]
     clouds = [PointCloud.from_numpy(*sweep.read_points()) for sweep in sweeps]
-    placed = [jax.device_put(c, device) for c, device in zip(clouds, itertools.cycle(jax.local_devices()))]
-    jax.block_until_ready(jaxbox.detect_batch(placed, config))
+    placed = [jax.device_put(c, device) for c, device in zip(clouds, itertools.cycle(devices))]
+    jax.block_until_ready(jaxbox.detect_batch(placed, config, devices=devices))
     batch = list(itertools.islice(itertools.cycle(placed), count))
     start = time.perf_counter()
-    jax.block_until_ready(jaxbox.detect_batch(batch, config))
+    jax.block_until_ready(jaxbox.detect_batch(batch, config, devices=devices))
     return count / (time.perf_counter() - start)
 
 
 def rate_of_stream(
-    sweeps: Sequence[Sweep], preset: str, count: int, cores: int, devices: int, workers: int
+    sweeps: Sequence[Sweep], preset: str, count: int, cores: int, num_devices: int, workers: int
 ) -> float:
     """Sweeps a second of `jaxbox.stream`, from files to boxes, once all devices or workers are at work."""
-    use(cores, devices)
-    start_up = 4 * workers * devices
+    devices = use(cores, num_devices) if workers == 1 else None
+    start_up = 4 * workers * num_devices
     results = jaxbox.stream(
-        repeated(sweeps, start_up + count), DetectorConfig.presets()[preset], workers=workers
+        repeated(sweeps, start_up + count),
+        DetectorConfig.presets()[preset],
+        workers=workers,
+        devices=devices,
     )
     for _ in range(start_up):
         next(results)
@@ -153,41 +157,70 @@ def rate_of_stream(
     return count / (time.perf_counter() - start)
 
 
+Way = tuple[str, str, Callable[..., float], tuple[int, ...]]
+
+
+def ways_on_a_cpu(cores: int) -> list[Way]:
+    """What works, on what, by which function, and its cores, devices and processes."""
+    return [
+        ("detect_batch", "one core", rate_of_batch, (1, 1)),
+        ("detect_batch", "all cores", rate_of_batch, (cores, 1)),
+        ("detect_batch", f"{cores} devices", rate_of_batch, (cores, cores)),
+        ("stream", "one core", rate_of_stream, (1, 1, 1)),
+        ("stream", "all cores", rate_of_stream, (cores, 1, 1)),
+        ("stream", f"{cores} devices", rate_of_stream, (cores, cores, 1)),
+        ("stream", f"{cores} workers", rate_of_stream, (cores, 1, cores)),
+    ]
+
+
+def ways_on_accelerators(cores: int, num_devices: int) -> list[Way]:
+    """Likewise; no processes, of which each would want a device of its own."""
+    counts = sorted({1, num_devices})
+    return [
+        *(("detect_batch", f"{n} devices", rate_of_batch, (cores, n)) for n in counts),
+        *(("stream", f"{n} devices", rate_of_stream, (cores, n, 1)) for n in counts),
+    ]
+
+
 def throughput(sweeps: Sequence[Sweep], preset: str, count: int, rounds: int) -> list[dict[str, Any]]:
-    """Sweeps a second by what works at them, and how many times that of the same work on one core.
+    """Sweeps a second by what works at them, and how many times that of the same call's first way.
 
     A ratio is taken within a round, in which all take their turn, and the median of the rounds' is given.
     """
     cores = len(os.sched_getaffinity(0))
-    ways: dict[tuple[str, str], tuple[Callable[..., float], tuple[int, ...]]] = {
-        ("detect_batch", ONE_CORE): (rate_of_batch, (1, 1)),
-        ("detect_batch", "all cores"): (rate_of_batch, (cores, 1)),
-        ("detect_batch", f"{cores} devices"): (rate_of_batch, (cores, cores)),
-        ("stream", ONE_CORE): (rate_of_stream, (1, 1, 1)),
-        ("stream", "all cores"): (rate_of_stream, (cores, 1, 1)),
-        ("stream", f"{cores} devices"): (rate_of_stream, (cores, cores, 1)),
-        ("stream", f"{cores} workers"): (rate_of_stream, (cores, 1, cores)),
-    }
-    rates: dict[tuple[str, str], list[float]] = {way: [] for way in ways}
-    for _ in range(rounds):
-        for way, (function, arguments) in ways.items():
-            # A process each: cores and devices cannot be changed once JAX runs.
-            spawn = multiprocessing.get_context("spawn")
-            with concurrent.futures.ProcessPoolExecutor(1, spawn) as pool:
-                rate = pool.submit(_call, function, (sweeps, preset, count, *arguments)).result()
-            rates[way].append(rate)
+    kind, num_devices = in_a_process(describe_devices, ())
+    ways = ways_on_a_cpu(cores) if kind == "cpu" else ways_on_accelerators(cores, num_devices)
+    rates = [
+        [in_a_process(function, (sweeps, preset, count, *arguments)) for *_, function, arguments in ways]
+        for _ in range(rounds)
+    ]
+    calls = [call for call, *_ in ways]
     return [
         {
             "call": call,
             "on": on,
-            "sweeps_per_s": float(np.median(measured)),
-            "times_one_core": float(np.median(np.divide(measured, rates[call, ONE_CORE]))),
+            "sweeps_per_s": float(np.median([measured[i] for measured in rates])),
+            "times_the_first": float(
+                np.median([measured[i] / measured[calls.index(call)] for measured in rates])
+            ),
         }
-        for (call, on), measured in rates.items()
+        for i, (call, on, *_) in enumerate(ways)
     ]
 
 
-def _call(function: Callable[..., float], arguments: tuple[Any, ...]) -> float:
+def describe_devices() -> tuple[str, int]:
+    """What JAX computes on, and how many of it there are."""
+    return jax.default_backend(), jax.local_device_count()
+
+
+def in_a_process(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    """Calls it in a process of its own: cores and devices cannot be changed once JAX runs."""
+    spawn = multiprocessing.get_context("spawn")
+    with concurrent.futures.ProcessPoolExecutor(1, spawn) as pool:
+        return pool.submit(_call, function, arguments).result()
+
+
+def _call(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
     common.enable_cache()
     return function(*arguments)
 
@@ -215,9 +248,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     names = ("loop", "detect_batch", "vmap", "vmap_same_bits")
     common.print_table(["batch", *names], [[r["batch"], *(r.get(n) for n in names)] for r in batches])
     print()
-    columns = ("call", "on", "sweeps_per_s", "times_one_core")
+    columns = ("call", "on", "sweeps_per_s", "times_the_first")
     common.print_table(
-        ["", "on", "sweeps a second", "times one core"], [[row[c] for c in columns] for row in rates]
+        ["", "on", "sweeps a second", "times the first"], [[row[c] for c in columns] for row in rates]
     )
     common.write_report({"sizes": sizes, "batches": batches, "throughput": rates}, options)
 

@@ -108,6 +108,7 @@ def circumstances(options: argparse.Namespace) -> dict[str, Any]:
         "processor": _processor(),
         "cpus": os.cpu_count(),
         "devices": [str(device) for device in jax.devices()],
+        "device_kind": jax.devices()[0].device_kind,
     }
 
 

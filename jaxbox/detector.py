@@ -102,12 +102,7 @@ class _Settings:
         return jax.tree.unflatten(self.structure, [jax.lax.squeeze(value, (0,)) for value in values])
 
 
-# A batch runs its sweeps one after the other: on a CPU, batched scatters, and loops that end with the
-# largest sweep of the batch, cost more than they save. Each step stands behind a wall, see `apart`, so
-# that the compiler makes the same code of it in the loop and without, and the batch has the singles' bits.
-@jax.jit
-@jax.custom_batching.sequential_vmap
-def _detect_jit(cloud: PointCloud, config: _Settings, key: jax.Array) -> Detections:
+def _find_vehicles(cloud: PointCloud, config: _Settings, key: jax.Array) -> Detections:
     # What a step finds is stored, or the compiler would work it out again in each later step that reads it,
     # and its scratch memory is freed: beyond 32 MB, glibc would return it to the system at each call, and
     # a sixth of the time would go into getting it back page by page.
@@ -135,3 +130,28 @@ def _with_settings(step: Callable[..., Any]) -> Callable[..., Any]:
         return step(*[each.unpack() if isinstance(each, _Settings) else each for each in inputs])
 
     return call
+
+
+_one_after_the_other = jax.custom_batching.sequential_vmap(_find_vehicles)
+_find = jax.custom_batching.custom_vmap(_find_vehicles)
+_detect_jit = jax.jit(_find)
+
+
+@_find.def_vmap
+def _find_many(_size: int, batched: Any, *operands: Any) -> tuple[Detections, Any]:
+    """A batch: on a CPU its sweeps one after the other, on an accelerator all of them step by step.
+
+    On a CPU batched scatters, and loops that end with the largest sweep of the batch, cost more than they
+    save. Each step stands behind a wall, see `apart`, so that the compiler makes the same code of it in the
+    loop and without, and the batch has the singles' bits. The kernels of one sweep do not fill an
+    accelerator, and to start them takes longer than they do.
+    """
+    axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
+    in_turn = jax.vmap(_one_after_the_other, axes)
+    if jax.default_backend() == "cpu":
+        # Where there is no accelerator, the other way would only be traced, for ten seconds.
+        found = in_turn(*operands)
+    else:
+        together = jax.vmap(_find_vehicles, axes)
+        found = jax.lax.platform_dependent(*operands, cpu=in_turn, default=together)
+    return found, jax.tree.map(lambda _: True, found)

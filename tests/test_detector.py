@@ -141,6 +141,26 @@ def test_a_batch_of_clouds_alone_has_the_shapes_of_the_singles_and_an_axis_more(
         assert (leaf.shape, leaf.dtype) == ((2, *single.shape), single.dtype)
 
 
+def test_a_batch_on_an_accelerator_finds_what_the_singles_do_on_a_cpu(monkeypatch):
+    # Run here, where it is slower: all sweeps at once, and each loop in its form for accelerators.
+    monkeypatch.setattr(jax, "default_backend", lambda: "cuda")
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, default, **_: default(*args))
+    sweeps = [street(0).xyz, np.zeros((0, 3)), street(1).xyz]
+    clouds = stack_clouds([PointCloud.from_numpy(xyz, capacity=CAPACITY) for xyz in sweeps])
+    many = jax.device_get(jax.vmap(detect)(clouds))
+    monkeypatch.undo()
+    for row, xyz in enumerate(sweeps):
+        single = run(xyz)
+        # Rounded otherwise, so that a point on a border may fall to the other side of it.
+        for name in ("center", "size", "yaw", "score"):
+            np.testing.assert_allclose(getattr(many, name)[row], getattr(single, name), atol=1e-4)
+        for name in ("label", "valid", "status"):
+            np.testing.assert_array_equal(getattr(many, name)[row], getattr(single, name))
+        for name in ("ground_mask", "point_component", "point_detection"):
+            assert np.mean(getattr(many, name)[row] != getattr(single, name)) < 1e-3
+    assert len(set(many.valid.sum(axis=1))) == len(sweeps)
+
+
 # The same boxes.
 
 TURNS = {
