@@ -30,8 +30,8 @@ _PLACES_OF_BYTE = np.array(
 )
 """(256, 8): where the set bits of each byte are, lowest first; 0 beyond."""
 
-FOLD_UNROLL = 4
-"""Points folded in one step of the loop over them."""
+FOLD_UNROLL = 4, 16
+"""Points folded in one step of the loop over them, on a CPU and on an accelerator."""
 
 
 def prefix_sum(values: jax.Array) -> jax.Array:
@@ -270,25 +270,41 @@ def masked_std(values: jax.Array, mask: jax.Array) -> jax.Array:
     return jnp.sqrt(masked_mean(centred**2, mask))
 
 
+def at_a_time(on_cpu: int, on_accelerator: int) -> int:
+    """How many rows a step of a loop takes: on a CPU what its cache holds, on an accelerator many more.
+
+    An accelerator starts a step for longer than the step takes. It is JAX's default backend that decides.
+
+    Args:
+      on_cpu: rows.
+      on_accelerator: rows.
+
+    Returns:
+      One of the two.
+    """
+    return on_cpu if jax.default_backend() == "cpu" else on_accelerator
+
+
 def map_rows(
     function: Callable[[Any], Any], rows: Any, *, num_rows: jax.Array, chunk: int, axis: int = 0
 ) -> Any:
     """Applies a batched function to the first `num_rows` rows, a chunk at a time.
 
     Work is proportional to the rows that are there, not to the capacity, and what a chunk needs
-    stays in the cache.
+    stays in the cache. On an accelerator all rows are one chunk.
 
     Args:
       function: maps a pytree of (chunk, ...) arrays to another one.
       rows: pytree of (P, ...) arrays.
       num_rows: () int32, how many rows count.
-      chunk: static, rows at a time.
+      chunk: static, rows at a time on a CPU.
       axis: static, 0 or -1: the axis of all arrays along which the rows lie; -1 for (..., P) arrays.
 
     Returns:
       Pytree of (P, ...) arrays; rows of chunks beyond `num_rows` are zero.
     """
     capacity = jax.tree.leaves(rows)[0].shape[axis]
+    chunk = at_a_time(chunk, max(chunk, capacity))
     missing = -capacity % chunk
 
     def extended(a: jax.Array) -> jax.Array:
@@ -327,13 +343,15 @@ def fold_rows(
 ) -> Any:
     """Folds rows into a state, chunk by chunk, and skips chunks beyond the rows that count.
 
+    On an accelerator all rows are one chunk.
+
     Args:
       update: maps the state, the indices of the rows of a chunk, and those rows, a pytree of (chunk,)
         arrays, to the next state.
       state: pytree of arrays.
       rows: pytree of (P,) arrays.
       num_rows: () int32, how many rows count.
-      chunk: static, rows at a time.
+      chunk: static, rows at a time on a CPU.
       absent: pytree of numbers, what the last chunk holds beyond the rows that count: such that `update`
         makes nothing of it.
 
@@ -341,6 +359,7 @@ def fold_rows(
       The state after the last chunk.
     """
     size = jax.tree.leaves(rows)[0].shape[0]
+    chunk = at_a_time(chunk, max(chunk, size))
     num_rows = jnp.minimum(num_rows, size)
     padded = jax.tree.map(lambda a: jnp.pad(a, (0, -size % chunk)), rows)
 
@@ -381,12 +400,12 @@ def fold_points(
     Returns:
       The state after the last point of each cluster.
     """
-    capacity = x.shape[0]
+    capacity, unroll = x.shape[0], at_a_time(*FOLD_UNROLL)
     there = jnp.arange(capacity)[:, None] < count
 
     def fill(values: jax.Array, value: Any) -> jax.Array:
         filled = jnp.where(there, values, value)
-        more = jnp.broadcast_to(value, (-capacity % FOLD_UNROLL, values.shape[1]))
+        more = jnp.broadcast_to(value, (-capacity % unroll, values.shape[1]))
         return jnp.concatenate([filled, more])
 
     filled = fill(x, absent[0]), fill(y, absent[1])
@@ -396,8 +415,8 @@ def fold_points(
     def step(loop: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
         first, state = loop
         # A point by its own index: a slice of several is ten times slower (XLA, CPU).
-        for k in range(FOLD_UNROLL):
+        for k in range(unroll):
             state = update(state, filled[0][first + k], filled[1][first + k])
-        return first + FOLD_UNROLL, state
+        return first + unroll, state
 
     return jax.lax.while_loop(lambda loop: loop[0] < most, step, (jnp.int32(0), init))[1]
