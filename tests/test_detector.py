@@ -161,6 +161,24 @@ def test_a_batch_on_an_accelerator_finds_what_the_singles_do_on_a_cpu(monkeypatc
     assert len(set(many.valid.sum(axis=1))) == len(sweeps)
 
 
+@pytest.mark.parametrize(
+    ("backend", "flags", "together"),
+    [("cpu", "", False), ("cuda", "", True), ("cuda", "--xla_gpu_deterministic_ops=true", False)],
+)
+def test_only_an_accelerator_takes_a_batch_at_once_and_not_where_scatters_are_ordered(
+    backend, flags, together, monkeypatch
+):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, default, **_: default(*args))
+    monkeypatch.setenv("XLA_FLAGS", flags)
+    monkeypatch.setattr(detector, "_one_after_the_other", lambda a, b: a + b)
+    monkeypatch.setattr(detector, "_find_vehicles", lambda a, b: a - b)
+    a, b = jnp.arange(3.0), jnp.float32(2)
+    found, batched = detector._find_many(3, (True, False), a, b)
+    assert batched
+    np.testing.assert_array_equal(found, a - b if together else a + b)
+
+
 # The same boxes.
 
 TURNS = {

@@ -41,7 +41,9 @@ def cell(value: Any) -> str:
 def made_with(report: dict[str, Any]) -> str:
     """What a result was measured on."""
     at = report["circumstances"]
+    device = at.get("device_kind", "cpu")
     machine = f"{at['processor']}, {at['cpus']} cores, jax {at['packages']['jax']}"
+    machine = machine if device == "cpu" else f"{device} beside {machine}"
     return f"\n\n*Recorded at commit {at['commit'][:8]}, {machine}.*"
 
 
@@ -122,6 +124,19 @@ def speed() -> str:
 
 
 WHOLES = ("host to host", "on the device")
+
+
+def gpu() -> str:
+    """Whole sweeps on a GPU, one by one and in batches."""
+    one_by_one = {"default": load("stages_h100"), "paper": load("stages_paper_h100")}
+    scaling = load("scaling_h100")
+    rows = [
+        (f"{preset}, {name}", r["whole"][name]["median"])
+        for preset, r in one_by_one.items()
+        for name in WHOLES
+    ]
+    rows += [(f"default, `jax.vmap` of {r['batch']}", r["vmap"]) for r in scaling["batches"] if "vmap" in r]
+    return table(["", "median ms a sweep"], rows) + made_with(scaling)
 
 
 def frontier() -> str:
@@ -387,6 +402,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "cuts": cuts,
     "ground": ground,
     "speed": speed,
+    "gpu": gpu,
     "frontier": frontier,
     "peers": peers,
     "fuzz": fuzz,
