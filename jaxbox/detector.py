@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import os
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +11,7 @@ import numpy as np
 
 from jaxbox import steps
 from jaxbox.config import DetectorConfig
+from jaxbox.devices import batches_at_once
 from jaxbox.masked import apart
 from jaxbox.types import Detections, PointCloud
 
@@ -150,12 +150,10 @@ def _find_many(_size: int, batched: Any, *operands: Any) -> tuple[Detections, An
     """
     axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
     in_turn = jax.vmap(_one_after_the_other, axes)
-    # What is out of bounds, the scatters that XLA orders write to the next row of a batch (jax 0.11.2, H100).
-    is_ordered = "deterministic_ops" in os.environ.get("XLA_FLAGS", "")
-    if is_ordered or jax.default_backend() == "cpu":
-        # Where there is no accelerator, the other way would only be traced, for ten seconds.
-        found = in_turn(*operands)
-    else:
+    if batches_at_once():
         together = jax.vmap(_find_vehicles, axes)
         found = jax.lax.platform_dependent(*operands, cpu=in_turn, default=together)
+    else:
+        # Not even traced together, which takes ten seconds.
+        found = in_turn(*operands)
     return found, jax.tree.map(lambda _: True, found)

@@ -12,6 +12,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbox.devices import at_a_time
+
 BLOCK = 512
 """Columns of the two-level prefix sum: XLA's CPU cumulative sum slows down with its length."""
 
@@ -268,21 +270,6 @@ def masked_std(values: jax.Array, mask: jax.Array) -> jax.Array:
     """
     centred = values - masked_mean(values, mask)[..., None]
     return jnp.sqrt(masked_mean(centred**2, mask))
-
-
-def at_a_time(on_cpu: int, on_accelerator: int) -> int:
-    """How many rows a step of a loop takes: on a CPU what its cache holds, on an accelerator many more.
-
-    An accelerator starts a step for longer than the step takes. It is JAX's default backend that decides.
-
-    Args:
-      on_cpu: rows.
-      on_accelerator: rows.
-
-    Returns:
-      One of the two.
-    """
-    return on_cpu if jax.default_backend() == "cpu" else on_accelerator
 
 
 def map_rows(
