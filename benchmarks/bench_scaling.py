@@ -92,23 +92,30 @@ def time_batches(
     rows = []
     for size in QUICK_BATCHES if quick else BATCHES:
         batch = list(itertools.islice(itertools.cycle(clouds), size))
+        row: dict[str, Any] = {"batch": size}
         ways: dict[str, Callable[[], Any]] = {
             "loop": lambda batch=batch: [jax.block_until_ready(jaxbox.detect(c, config)) for c in batch],
             "detect_batch": lambda batch=batch: jaxbox.detect_batch(batch, config),
         }
         if size in (QUICK_VMAPPED if quick else VMAPPED):
-            vmapped = jax.jit(jax.vmap(lambda cloud: jaxbox.detect(cloud, config)))
-            ways["vmap"] = functools.partial(vmapped, jaxbox.stack_clouds(batch))
+            stacked = jaxbox.stack_clouds(batch)
+            vmapped = jax.jit(jax.vmap(lambda cloud: jaxbox.detect(cloud, config))).lower(stacked).compile()
+            ways["vmap"] = functools.partial(vmapped, stacked)
+            row["vmap_scratch_mb"] = _scratch_bytes(vmapped) / 1e6
         answers = {name: jax.device_get(jax.block_until_ready(way())) for name, way in ways.items()}
         spent: dict[str, list[float]] = {name: [] for name in ways}
         for _ in range(2 if quick else 5):
             for name, way in ways.items():
                 spent[name].append(common.milliseconds(way)[0] / size)
-        row: dict[str, Any] = {"batch": size} | {name: float(np.median(ms)) for name, ms in spent.items()}
+        row |= {name: float(np.median(ms)) for name, ms in spent.items()}
         if "vmap" in answers:
             row["vmap_same_bits"] = same_bits(answers["vmap"], answers["loop"])
         rows.append(row)
     return rows
+
+
+def _scratch_bytes(compiled: Any) -> int:
+    return compiled.memory_analysis().temp_size_in_bytes
 
 
 def repeated(sweeps: Sequence[Sweep], count: int) -> Iterator[Sweep]:
@@ -177,8 +184,8 @@ def ways_on_accelerators(cores: int, num_devices: int) -> list[Way]:
     """Likewise; no processes, of which each would want a device of its own."""
     counts = sorted({1, num_devices})
     return [
-        *(("detect_batch", f"{n} devices", rate_of_batch, (cores, n)) for n in counts),
-        *(("stream", f"{n} devices", rate_of_stream, (cores, n, 1)) for n in counts),
+        *(("detect_batch", f"devices: {n}", rate_of_batch, (cores, n)) for n in counts),
+        *(("stream", f"devices: {n}", rate_of_stream, (cores, n, 1)) for n in counts),
     ]
 
 
@@ -237,6 +244,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sweeps = common.kitti_sweeps(8)
     points = [sweep.read_points()[0] for sweep in sweeps]
     count, rounds = (QUICK_STREAMED, 1) if quick else (STREAMED, ROUNDS)
+    # Before this process has an accelerator's memory, which it would not share.
     rates = throughput(sweeps, options.preset, count, rounds)
     sizes = time_sizes(
         points, QUICK_CAPACITIES if quick else CAPACITY_BUCKETS, config, QUICK_RUNS if quick else RUNS
@@ -247,7 +255,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     header = ["points", "median ms", "p90 ms", "ns a point", "first call s", "status"]
     common.print_table(header, [[*(r[c] for c in columns), ", ".join(r["status"])] for r in sizes])
     print("\nms a sweep, 131,072 points")
-    names = ("loop", "detect_batch", "vmap", "vmap_same_bits")
+    names = ("loop", "detect_batch", "vmap", "vmap_same_bits", "vmap_scratch_mb")
     common.print_table(["batch", *names], [[r["batch"], *(r.get(n) for n in names)] for r in batches])
     print()
     columns = ("call", "on", "sweeps_per_s", "times_the_first")

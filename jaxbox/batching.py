@@ -19,8 +19,9 @@ def detect_batch(
 ) -> list[Detections]:
     """Finds the vehicles of many sweeps, over several devices at once.
 
-    The devices take turns, and each runs `detect` as for a single sweep: the same program, so the same bits,
-    and no more compiles than one a device and capacity. Calls are dispatched without waiting: while a
+    The devices take turns, and each runs `detect` as for a single sweep: the same program, so the same bits
+    (on a CPU), and no more compiles than one a device and capacity. An accelerator is not filled by single
+    sweeps: `jax.vmap` them there. Calls are dispatched without waiting: while a
     device works, the next sweeps are sent to the others.
 
     Several devices of a CPU have to be asked for before JAX starts:

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxbox import steps
 from jaxbox.config import DetectorConfig
-from jaxbox.devices import batches_at_once
+from jaxbox.devices import batch_together
 from jaxbox.masked import apart
 from jaxbox.types import Detections, PointCloud
 
@@ -23,14 +23,15 @@ def detect(
 
     One jitted function of fixed shape: it compiles once for each capacity and set of static settings, and
     never again when sweeps change length or thresholds move. `jax.vmap` it over a batch of clouds, of
-    configurations or of keys: on a CPU the batch gives the singles' answers bit for bit, on an accelerator
-    it is many times as fast, and sums are rounded otherwise. `detect_batch` spreads a list of clouds over
-    devices.
+    configurations or of keys: on a CPU the batch gives the singles' answers bit for bit; on an accelerator
+    it is many times as fast, rounded otherwise, and takes memory for all of them, which
+    ``jax.lax.map(jaxbox.detect, clouds, batch_size=64)`` bounds. `detect_batch` spreads a list of clouds
+    over devices.
 
     Args:
       cloud: one sweep, see `PointCloud.from_numpy`.
       config: the settings; None for the default preset.
-      key: JAX random key for RANSAC; None for `jax.random.key(0)`. The same key gives the same bits.
+      key: JAX random key for RANSAC; None for `jax.random.key(0)`. On a CPU the same key gives the same bits.
 
     Returns:
       The detections, best score first. Whatever was dropped is in `status` and `counts`.
@@ -146,11 +147,12 @@ def _find_many(_size: int, batched: Any, *operands: Any) -> tuple[Detections, An
     On a CPU batched scatters, and loops that end with the largest sweep of the batch, cost more than they
     save. Each step stands behind a wall, see `apart`, so that the compiler makes the same code of it in the
     loop and without, and the batch has the singles' bits. The kernels of one sweep do not fill an
-    accelerator, and to start them takes longer than they do.
+    accelerator, and to launch them takes longer than to run them; there is no wall between the steps of such
+    a batch, whose conditionals do all of their branches.
     """
     axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
     in_turn = jax.vmap(_one_after_the_other, axes)
-    if batches_at_once():
+    if batch_together():
         together = jax.vmap(_find_vehicles, axes)
         found = jax.lax.platform_dependent(*operands, cpu=in_turn, default=together)
     else:

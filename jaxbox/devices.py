@@ -1,4 +1,4 @@
-"""What JAX computes on, where that decides how a program is built; its results change by rounding alone."""
+"""What JAX computes on, where that decides how a program is built. It changes results by rounding only."""
 
 import os
 
@@ -8,7 +8,7 @@ import jax
 def at_a_time(on_cpu: int, on_accelerator: int) -> int:
     """How many rows a step of a loop takes: on a CPU what its cache holds, on an accelerator many more.
 
-    An accelerator starts a step for longer than the step takes. It is JAX's default backend that decides.
+    To launch a kernel takes an accelerator longer than to run so small a one. JAX's default backend decides.
 
     Args:
       on_cpu: rows.
@@ -20,13 +20,14 @@ def at_a_time(on_cpu: int, on_accelerator: int) -> int:
     return on_cpu if jax.default_backend() == "cpu" else on_accelerator
 
 
-def batches_at_once() -> bool:
-    """Whether a batch may go through each step together, and not one sweep after the other.
+def batch_together() -> bool:
+    """Whether a batch goes through each step together, and not one sweep after the other.
 
-    On an accelerator; not with ``XLA_FLAGS=--xla_gpu_deterministic_ops=true`` or the like: what is out of
-    bounds, ordered scatters write to the next row of a batch (jax 0.11.2, H100).
+    On an accelerator; not with ``XLA_FLAGS=--xla_gpu_deterministic_ops=true`` or the like: in a batch, XLA's
+    deterministic scatters write updates that are to be dropped, as their index is out of bounds, to the next
+    row (seen with jax 0.11.2 on an H100). Nothing shows the same option where it is given to the compiler.
 
     Returns:
-      True where it may.
+      True where it does.
     """
     return jax.default_backend() != "cpu" and "deterministic_ops" not in os.environ.get("XLA_FLAGS", "")

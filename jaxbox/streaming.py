@@ -77,7 +77,7 @@ def stream(
         workers, each of which computes on its own first device.
 
     Yields:
-      The result of each sweep, in their order, with the same bits as `detect` gives. One that cannot be
+      The result of each sweep, in their order, as `detect` gives it. One that cannot be
       read comes with an error, and the others go on. One whose process dies is tried in a new process, and
       comes with an error where that dies too.
 

@@ -134,20 +134,31 @@ def test_a_batch_of_sweeps_thresholds_and_keys_gives_the_bits_of_the_singles():
     assert len(set(many.valid.sum(axis=1))) == len(sweeps)
 
 
-def test_a_batch_of_clouds_alone_has_the_shapes_of_the_singles_and_an_axis_more():
+def batch_anew(clouds):
+    """A batch of clouds by a program of its own: tests that change how it is built leave nothing behind."""
+    find = jax.jit(jax.vmap(detector._find, (0, None, None)))
+    return find, detector._operands(clouds, None, None)
+
+
+def test_both_ways_of_a_batch_have_the_shapes_of_the_singles_and_an_axis_more(monkeypatch):
     clouds = stack_clouds([PointCloud.from_numpy(street(seed).xyz, capacity=CAPACITY) for seed in (0, 1)])
-    batch = jax.eval_shape(jax.vmap(detect), clouds)
+    # So that the way for accelerators is built beside the one for CPUs.
+    monkeypatch.setattr(jax, "default_backend", lambda: "cuda")
+    find, operands = batch_anew(clouds)
+    batch = jax.eval_shape(find, *operands)
+    monkeypatch.undo()
     for leaf, single in zip(jax.tree.leaves(batch), jax.tree.leaves(found(0)), strict=True):
         assert (leaf.shape, leaf.dtype) == ((2, *single.shape), single.dtype)
 
 
 def test_a_batch_on_an_accelerator_finds_what_the_singles_do_on_a_cpu(monkeypatch):
+    sweeps = [street(0).xyz, np.zeros((0, 3)), street(1).xyz]
+    clouds = stack_clouds([PointCloud.from_numpy(xyz, capacity=CAPACITY) for xyz in sweeps])
     # Run here, where it is slower: all sweeps at once, and each loop in its form for accelerators.
     monkeypatch.setattr(jax, "default_backend", lambda: "cuda")
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, default, **_: default(*args))
-    sweeps = [street(0).xyz, np.zeros((0, 3)), street(1).xyz]
-    clouds = stack_clouds([PointCloud.from_numpy(xyz, capacity=CAPACITY) for xyz in sweeps])
-    many = jax.device_get(jax.vmap(detect)(clouds))
+    find, operands = batch_anew(clouds)
+    many = jax.device_get(find(*operands))
     monkeypatch.undo()
     for row, xyz in enumerate(sweeps):
         single = run(xyz)

@@ -94,6 +94,27 @@ def test_sweeps_of_any_size_are_made_of_real_ones(benchmark):
     assert scaling.resize(clouds, 35).shape == (35, 3)
 
 
+def test_throughput_is_measured_by_cores_on_a_cpu_and_by_devices_on_accelerators(benchmark, monkeypatch):
+    scaling = benchmark("bench_scaling")
+    assert [on for call, on, *_ in scaling.ways_on_a_cpu(2) if call == "stream"] == [
+        "one core",
+        "all cores",
+        "2 devices",
+        "2 workers",
+    ]
+    assert [way[:2] for way in scaling.ways_on_accelerators(16, 1)] == [
+        ("detect_batch", "devices: 1"),
+        ("stream", "devices: 1"),
+    ]
+
+    def called(function, arguments):
+        return ("cuda", 2) if function is scaling.describe_devices else float(arguments[4])
+
+    monkeypatch.setattr(scaling, "in_a_process", called)
+    rows = scaling.throughput([], "fast", 10, 2)
+    assert [(row["sweeps_per_s"], row["times_the_first"]) for row in rows] == [(1, 1), (2, 2)] * 2
+
+
 def test_bits_of_a_batch_are_compared_with_each_single(benchmark):
     scaling = benchmark("bench_scaling")
     batch = {"a": np.array([[1.0, 2.0], [3.0, 4.0]])}

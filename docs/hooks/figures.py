@@ -135,7 +135,9 @@ def gpu() -> str:
         for preset, r in one_by_one.items()
         for name in WHOLES
     ]
-    rows += [(f"default, `jax.vmap` of {r['batch']}", r["vmap"]) for r in scaling["batches"] if "vmap" in r]
+    for row in scaling["batches"]:
+        ways = ("loop", "vmap") if "vmap" in row else ()
+        rows += [(f"default, {row['batch']} sweeps by a {way}", row[way]) for way in ways]
     return table(["", "median ms a sweep"], rows) + made_with(scaling)
 
 
