@@ -101,7 +101,8 @@ def time_batches(
             stacked = jaxbox.stack_clouds(batch)
             vmapped = jax.jit(jax.vmap(lambda cloud: jaxbox.detect(cloud, config))).lower(stacked).compile()
             ways["vmap"] = functools.partial(vmapped, stacked)
-            row["vmap_scratch_mb"] = _scratch_bytes(vmapped) / 1e6
+            memory: Any = vmapped.memory_analysis()
+            row["vmap_scratch_mb"] = memory.temp_size_in_bytes / 1e6
         answers = {name: jax.device_get(jax.block_until_ready(way())) for name, way in ways.items()}
         spent: dict[str, list[float]] = {name: [] for name in ways}
         for _ in range(2 if quick else 5):
@@ -112,10 +113,6 @@ def time_batches(
             row["vmap_same_bits"] = same_bits(answers["vmap"], answers["loop"])
         rows.append(row)
     return rows
-
-
-def _scratch_bytes(compiled: Any) -> int:
-    return compiled.memory_analysis().temp_size_in_bytes
 
 
 def repeated(sweeps: Sequence[Sweep], count: int) -> Iterator[Sweep]:

@@ -77,9 +77,9 @@ def stream(
         workers, each of which computes on its own first device.
 
     Yields:
-      The result of each sweep, in their order, as `detect` gives it. One that cannot be
-      read comes with an error, and the others go on. One whose process dies is tried in a new process, and
-      comes with an error where that dies too.
+      The result of each sweep, in their order, as `detect` gives it: on a CPU, with the same bits. One that
+      cannot be read comes with an error, and the others go on. One whose process dies is tried in a new
+      process, and comes with an error where that dies too.
 
     Raises:
       ValueError: for settings that contradict each other, workers below 1, no devices, or devices together

@@ -134,6 +134,16 @@ def test_a_batch_of_sweeps_thresholds_and_keys_gives_the_bits_of_the_singles():
     assert len(set(many.valid.sum(axis=1))) == len(sweeps)
 
 
+def test_a_batch_of_clouds_alone_has_the_shapes_of_the_singles_and_an_axis_more():
+    clouds = stack_clouds([PointCloud.from_numpy(street(seed).xyz, capacity=CAPACITY) for seed in (0, 1)])
+    assert_shapes_of_singles(jax.eval_shape(jax.vmap(detect), clouds), 2)
+
+
+def assert_shapes_of_singles(batch, size):
+    for leaf, single in zip(jax.tree.leaves(batch), jax.tree.leaves(found(0)), strict=True):
+        assert (leaf.shape, leaf.dtype) == ((size, *single.shape), single.dtype)
+
+
 def batch_anew(clouds):
     """A batch of clouds by a program of its own: tests that change how it is built leave nothing behind."""
     find = jax.jit(jax.vmap(detector._find, (0, None, None)))
@@ -147,8 +157,7 @@ def test_both_ways_of_a_batch_have_the_shapes_of_the_singles_and_an_axis_more(mo
     find, operands = batch_anew(clouds)
     batch = jax.eval_shape(find, *operands)
     monkeypatch.undo()
-    for leaf, single in zip(jax.tree.leaves(batch), jax.tree.leaves(found(0)), strict=True):
-        assert (leaf.shape, leaf.dtype) == ((2, *single.shape), single.dtype)
+    assert_shapes_of_singles(batch, 2)
 
 
 def test_a_batch_on_an_accelerator_finds_what_the_singles_do_on_a_cpu(monkeypatch):
