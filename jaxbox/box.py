@@ -62,7 +62,7 @@ class PointLists:
         j = jnp.arange(self.max_points)[:, None]
         spread = j * (total // self.max_points) + j * (total % self.max_points) // self.max_points
         # Stored, since what a look-up has to work out first does not vectorise.
-        row = store(start + jnp.where(total > self.max_points, spread, j), jnp.all(total >= 0))
+        row = store(start + jnp.where(total > self.max_points, spread, j), total[0] >= 0)
         x, y = (jnp.take(values, row, mode="clip") for values in (self.x, self.y))
         return x, y, jnp.minimum(total, self.max_points)
 
@@ -273,9 +273,10 @@ def best_rectangles(
     """
     num_angles = curve.shape[0]
     total = curve + (insistence * preference)[:, None]
-    # An argmax does not vectorise (XLA, CPU).
+    # An argmax does not vectorise; a minimum of integers takes several kernels, one of floats one (XLA, CPU).
     is_best = total >= jnp.max(total, axis=0)
-    best = jnp.min(jnp.where(is_best, jnp.arange(num_angles)[:, None], num_angles - 1), axis=0)
+    angle = jnp.arange(num_angles, dtype=jnp.float32)[:, None]
+    best = jnp.min(jnp.where(is_best, angle, num_angles - 1), axis=0).astype(jnp.int32)
     u0, u1, v0, v1 = jnp.take_along_axis(extents, best[None, None], axis=1)[:, 0]
     worth = jnp.take_along_axis(curve, best[None], axis=0)[0]
     return Rectangles(

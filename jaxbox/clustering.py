@@ -188,8 +188,9 @@ def label_components(flags: jax.Array, row: CellRow, *, max_runs: int) -> Compon
 
     Nodes are the runs of occupied cells along a line. Where two runs on neighbouring lines touch first, one
     of them starts: so one look-up on each line before and one on each line after the start of every run find
-    all links. The first look-up alone makes a forest; over the others its trees hook onto lower ones, and
-    pointers jump, until nothing moves (Shiloach and Vishkin, 1982).
+    all links. A CPU joins runs link after link (union-find). Elsewhere the first look-up makes a forest;
+    over the others its trees hook onto lower ones, and pointers jump, until nothing moves (Shiloach and
+    Vishkin, 1982).
 
     On 20 KITTI object frames, 3D components of 0.35 m cells agree with the paper's queue over a KD-tree
     (Algorithm II) at a radius of 0.6 m to a median adjusted Rand index of 0.98, at least 0.82
@@ -211,25 +212,11 @@ def label_components(flags: jax.Array, row: CellRow, *, max_runs: int) -> Compon
     starts = words & ~after
     runs_before, num_runs = _prefix(_population(starts))
 
-    cell = _starting_cells(starts, runs_before, max_runs)
+    runs = _Runs(words, after, starts, runs_before, _starting_cells(starts, runs_before, max_runs), num_runs)
+    join = {"cpu": _join_one_by_one, "default": _join_in_rounds}
+    join = {platform: functools.partial(function, row) for platform, function in join.items()}
+    parent = jax.lax.platform_dependent(runs, **join)
     itself = jnp.arange(max_runs, dtype=jnp.int32)
-    present = (itself > NONE) & (itself < num_runs)
-
-    # Two runs touch first where the one on the later line starts: then the other holds that cell of its line
-    # or the one before; or one cell before the other starts: then the one on the later line holds that.
-    back = _by_map(row, cell)
-    # Stored, since what a look-up has to work out first does not vectorise.
-    place = functools.partial(_place, num_strips=row.num_strips)
-    before, behind = store(
-        ([place(cell - b) for b in back], [place(cell + b - 1) for b in back]), num_runs >= 0
-    )
-
-    def link(bits: jax.Array, at: Place) -> jax.Array:
-        return jnp.where(present & _is_set(bits, at), _run_at(starts, runs_before, at), itself)
-
-    lower = [link(words | after, at) for at in before]
-    upper = [link(words, at) for at in behind]
-    parent = _connect(lower[0], [*lower[1:], *upper])
     number = prefix_sum((parent == itself) & (itself < num_runs)) - 1
     first_run = jnp.append(runs_before[0, jnp.array(row.starts[:-1]) // STRIP], num_runs)
     return Components(
@@ -275,16 +262,22 @@ def _place(cell: jax.Array, num_strips: int) -> Place:
     return word * num_strips + strip, (cell & (WORD_BITS - 1)).astype(jnp.uint32)
 
 
+def _read(values: jax.Array, index: jax.Array) -> jax.Array:
+    if index.ndim == 0:
+        return values.at[index].get(mode="promise_in_bounds")
+    return jnp.take(values, index, mode="clip")
+
+
 def _is_set(words: jax.Array, place: Place) -> jax.Array:
     word, bit = place
-    return jnp.take(words, word, mode="clip") >> bit & 1 == 1
+    return _read(words, word) >> bit & 1 == 1
 
 
 def _run_at(starts: jax.Array, runs_before: jax.Array, place: Place) -> jax.Array:
     """The last run that starts at a cell or before it."""
     word, bit = place
-    up_to = jnp.take(starts, word, mode="clip") & ((jnp.uint32(2) << bit) - 1)
-    return jnp.take(runs_before, word, mode="clip") + _population(up_to) - 1
+    up_to = _read(starts, word) & ((jnp.uint32(2) << bit) - 1)
+    return _read(runs_before, word) + _population(up_to) - 1
 
 
 def _starting_cells(starts: jax.Array, runs_before: jax.Array, size: int) -> jax.Array:
@@ -304,20 +297,80 @@ def _starting_cells(starts: jax.Array, runs_before: jax.Array, size: int) -> jax
     return cell + _population((bits & -bits) - 1)
 
 
-def _by_map(row: CellRow, cell: jax.Array) -> list[jax.Array]:
-    """`CellRow.lines_back` at each cell; 0, which leads to the cell itself, where its map has fewer lines."""
-    steps = []
-    for back in itertools.zip_longest(*row.lines_back, fillvalue=0):
-        step = jnp.full_like(cell, back[0])
-        for start, other in zip(row.starts[1:-1], back[1:], strict=True):
-            step = jnp.where(cell >= start, other, step)
-        steps.append(step)
-    return steps
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class _Runs:
+    """The nodes: runs of occupied cells along a line."""
+
+    words: jax.Array  # (R, S) uint32, bits of the occupied cells
+    after: jax.Array  # (R, S) uint32, of those one further on
+    starts: jax.Array  # (R, S) uint32, of those that start a run
+    before: jax.Array  # (R, S) int32, runs that start before each word
+    cell: jax.Array  # (C,) int32, at which each run starts
+    num: jax.Array  # () int32, may exceed C
 
 
-def _connect(parent: jax.Array, links: list[jax.Array]) -> jax.Array:
-    """(C,) int32: the lowest node of each node's component."""
-    num_nodes = parent.shape[0]
+def _beside(row: CellRow, cell: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
+    """Where a run that starts at each cell may touch others: on each line before it, and on each line after.
+
+    Two runs touch first where the one on the later line starts: then the other holds that cell of its line
+    or the one before; or one cell before the other starts: then the one on the later line holds that.
+    """
+    back = _by_map(row, cell)
+    return [cell - b for b in back], [cell + b - 1 for b in back]
+
+
+def _join_one_by_one(row: CellRow, runs: _Runs) -> jax.Array:
+    """Union-find, link after link: XLA compiles so small loops to native code on the CPU."""
+
+    def root_of(node: jax.Array, above: jax.Array) -> jax.Array:
+        return jax.lax.while_loop(lambda i: _read(above, i) != i, lambda i: _read(above, i), node)
+
+    def hang(above: jax.Array, node: jax.Array, root: jax.Array) -> jax.Array:
+        return above.at[node].set(root, mode="promise_in_bounds")
+
+    def join(is_before: bool, k: int, node: jax.Array, above: jax.Array) -> jax.Array:
+        cell = _beside(row, _read(runs.cell, node))[not is_before][k]
+        place = _place(cell, row.num_strips)
+        is_set = _is_set(runs.words, place)
+        if is_before:
+            is_set = is_set | _is_set(runs.after, place)
+
+        def hook(_: jax.Array, above: jax.Array) -> jax.Array:
+            other = _run_at(runs.starts, runs.before, place)
+            ends = root_of(node, above), root_of(other, above)
+            low = jnp.minimum(*ends)
+            # The node itself, too, so that its way to the root is short.
+            return hang(hang(above, jnp.maximum(*ends), low), node, low)
+
+        # A conditional would copy all that is above.
+        return jax.lax.fori_loop(0, (is_set & (node > NONE)).astype(jnp.int32), hook, above)
+
+    size = runs.cell.shape[0]
+    num = jnp.minimum(runs.num, size)
+    flat = [jnp.reshape(words, -1) for words in (runs.words, runs.after, runs.starts, runs.before)]
+    runs = _Runs(*flat, cell=runs.cell, num=num)
+    above = jnp.arange(size, dtype=jnp.int32)
+    for is_before in (True, False):
+        for k in range(max(map(len, row.lines_back))):
+            above = jax.lax.fori_loop(0, num, functools.partial(join, is_before, k), above)
+    return jax.lax.fori_loop(0, num, lambda i, above: hang(above, i, root_of(i, above)), above)
+
+
+def _join_in_rounds(row: CellRow, runs: _Runs) -> jax.Array:
+    """The first kind of link makes a forest; its trees hook onto lower ones over the others."""
+    num_nodes = runs.cell.shape[0]
+    itself = jnp.arange(num_nodes, dtype=jnp.int32)
+    present = (itself > NONE) & (itself < runs.num)
+    # Stored, since what a look-up has to work out first does not vectorise.
+    place = functools.partial(_place, num_strips=row.num_strips)
+    before, behind = store(jax.tree.map(place, _beside(row, runs.cell)), runs.num >= 0)
+
+    def link(bits: jax.Array, at: Place) -> jax.Array:
+        return jnp.where(present & _is_set(bits, at), _run_at(runs.starts, runs.before, at), itself)
+
+    links = [link(runs.words | runs.after, at) for at in before]
+    parent, *links = links + [link(runs.words, at) for at in behind]
     links = store(links, parent[NONE] >= 0)
     ends = jnp.concatenate(links)
     # Few nodes have a link of every kind: those that there are make a list.
@@ -352,3 +405,14 @@ def _jump(parent: jax.Array) -> jax.Array:
         return higher, jnp.any(higher != parent)
 
     return jax.lax.while_loop(lambda state: state[1], jump, (parent, jnp.bool_(True)))[0]
+
+
+def _by_map(row: CellRow, cell: jax.Array) -> list[jax.Array]:
+    """`CellRow.lines_back` at each cell; 0, which leads to the cell itself, where its map has fewer lines."""
+    steps = []
+    for back in itertools.zip_longest(*row.lines_back, fillvalue=0):
+        step = jnp.full_like(cell, back[0])
+        for start, other in zip(row.starts[1:-1], back[1:], strict=True):
+            step = jnp.where(cell >= start, other, step)
+        steps.append(step)
+    return steps

@@ -132,7 +132,7 @@ def build_evidence(
     rho = jnp.sqrt(xyz[:, 0] ** 2 + xyz[:, 1] ** 2)
     seen = mask & (rho >= min_range_m)
     # Stored, or each scatter would work it out again.
-    azimuth = store(azimuth_cell(_arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths), jnp.any(seen))
+    azimuth = store(azimuth_cell(_arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths), ~(rho[0] < 0))
     num_blocks = num_ranges // BLOCK + 1
     size = num_blocks * BLOCK * num_azimuths
 
@@ -305,13 +305,15 @@ def cast_rays(
     Reference: oracle `jaxbox.reference.box_evidence`.
     """
     shape = center.shape[:-1]
-    there = jnp.any(length >= 0)
+    there = evidence.support[0, 0] >= 0
     length, width, yaw = (jnp.broadcast_to(a, shape).reshape(-1) for a in (length, width, yaw))
     # Stored, or what is the same for all rays of a box would be worked out for each.
     fan = store(_ray_fan(center.reshape(-1, 2), length / 2, width / 2, yaw), there)
     azimuth, enter, leave = store(_ray_stretches(fan, num_rays), there)
     met = store(_sort_rays(evidence, azimuth, enter, leave, range_cell_m, there), there)
-    hit, free, deep, crosses, free_cells, cells = (jnp.sum(a, axis=0).reshape(shape) for a in met)
+    # Sums of integers take several kernels, those of floats one (XLA, CPU), and these are exact.
+    sums = (jnp.sum(a, axis=0, dtype=jnp.float32).reshape(shape) for a in met)
+    hit, free, deep, crosses, free_cells, cells = sums
     total = jnp.maximum(crosses, 1)
     return RayFractions(
         hit=hit / total,

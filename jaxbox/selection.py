@@ -6,12 +6,19 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxbox.masked import lookup, prefix_sum, store, take
 from jaxbox.types import Clusters
 
-NUM_BOUNDS = 8
-"""Columns of the table of bounds, of which six are used: a row of eight is a vector of the processor."""
+NUM_COLUMNS = 8
+"""Columns of the table of statistics: a row of eight is a vector of the processor."""
+
+NUM_BOUNDS = 6
+"""Columns that hold a maximum; the others, a sum."""
+
+MAPS_PER_LOOP = 4
+"""Maps gone through in one native loop: with too much to do in a step, it would not be native any more."""
 
 
 @jax.tree_util.register_dataclass
@@ -19,10 +26,24 @@ NUM_BOUNDS = 8
 class Statistics:
     """What the size gates ask of each component."""
 
-    count: jax.Array
-    """(C, 2) int32: points, and those of them between the slab's heights."""
-    upper: jax.Array
-    """(C, 8) float32, m: greatest x, y, height, -x, -y and -height; the last two are not used."""
+    table: jax.Array
+    """(C, 8) float32: greatest x, y, height, -x, -y and -height, m; points, and those of them between the
+    slab's heights, which float32 counts exactly up to 2^24."""
+
+    @property
+    def upper(self) -> jax.Array:
+        """(C, 6) float32, m: greatest x, y, height, -x, -y and -height."""
+        return self.table[:, :NUM_BOUNDS]
+
+    @property
+    def num_points(self) -> jax.Array:
+        """(C,) int32."""
+        return self.table[:, NUM_BOUNDS].astype(jnp.int32)
+
+    @property
+    def num_slab(self) -> jax.Array:
+        """(C,) int32: points between the slab's heights."""
+        return self.table[:, NUM_BOUNDS + 1].astype(jnp.int32)
 
 
 def find_statistics(
@@ -47,65 +68,61 @@ def find_statistics(
     Returns:
       The statistics; no points, and bounds of minus infinity, where there are none.
     """
-    none = Statistics(
-        jnp.zeros((max_components, 2), jnp.int32), jnp.full((max_components, NUM_BOUNDS), -jnp.inf)
+    is_bound = np.arange(NUM_COLUMNS) < NUM_BOUNDS
+    none = jnp.broadcast_to(jnp.where(is_bound, -jnp.inf, 0), (max_components, NUM_COLUMNS))
+    points = xy, height, in_slab
+    return Statistics(
+        jax.lax.platform_dependent(
+            none, component, num_points, points, cpu=_add_one_by_one, default=_add_at_once
+        )
     )
-    return jax.lax.platform_dependent(
-        none, component, num_points, xy, height, in_slab, cpu=_add_one_by_one, default=_add_at_once
-    )
+
+
+Points = tuple[jax.Array, jax.Array, jax.Array]
+"""x and y (N, 2), heights (N,), m, and whether they are between the slab's heights (N,)."""
 
 
 def _add_one_by_one(
-    statistics: Statistics,
-    component: jax.Array,
-    num_points: jax.Array,
-    xy: jax.Array,
-    height: jax.Array,
-    in_slab: jax.Array,
-) -> Statistics:
-    """Point after point: XLA compiles so small a loop to native code on the CPU, which adds a row at once.
+    table: jax.Array, component: jax.Array, num_points: jax.Array, points: Points
+) -> jax.Array:
+    """Point after point: XLA compiles so small a loop to native code on the CPU, which adds a row at once."""
+    xy, height, in_slab = points
 
-    Map after map, so that a step is small however many there are.
-    """
+    def add(maps: range, i: jax.Array, table: jax.Array) -> jax.Array:
+        own = _own_row(xy[i], height[i], in_slab[i])
+        for on_map in maps:
+            row = component[on_map, i]
+            table = jax.lax.dynamic_update_index_in_dim(table, _joined(table[row], own), row, 0)
+        return table
 
-    def add(on_map: int, i: jax.Array, before: Statistics) -> Statistics:
-        row = component[on_map, i]
-        counted = jnp.stack([jnp.int32(1), in_slab[i].astype(jnp.int32)])
-        reached = _reach(xy[i, 0], xy[i, 1], height[i])
-        return Statistics(
-            jax.lax.dynamic_update_index_in_dim(before.count, before.count[row] + counted, row, 0),
-            jax.lax.dynamic_update_index_in_dim(
-                before.upper, jnp.maximum(before.upper[row], reached), row, 0
-            ),
-        )
-
-    for on_map in range(component.shape[0]):
-        statistics = jax.lax.fori_loop(0, num_points, functools.partial(add, on_map), statistics)
-    return statistics
+    maps = range(component.shape[0])
+    for first in maps[::MAPS_PER_LOOP]:
+        some = maps[first : first + MAPS_PER_LOOP]
+        table = jax.lax.fori_loop(0, num_points, functools.partial(add, some), table)
+    return table
 
 
-def _add_at_once(
-    statistics: Statistics,
-    component: jax.Array,
-    num_points: jax.Array,
-    xy: jax.Array,
-    height: jax.Array,
-    in_slab: jax.Array,
-) -> Statistics:
-    row = jnp.where(jnp.arange(height.shape[0]) < num_points, component, statistics.count.shape[0])
-    counted = jnp.stack([jnp.ones_like(in_slab, jnp.int32), in_slab.astype(jnp.int32)], axis=1)
-    reached = _reach(xy[:, 0], xy[:, 1], height)
-    counted, reached = (jnp.broadcast_to(a, (*row.shape, a.shape[1])) for a in (counted, reached))
-    return Statistics(
-        statistics.count.at[row].add(counted, mode="drop"),
-        statistics.upper.at[row].max(reached, mode="drop"),
-    )
+def _add_at_once(table: jax.Array, component: jax.Array, num_points: jax.Array, points: Points) -> jax.Array:
+    xy, height, in_slab = points
+    row = jnp.where(jnp.arange(height.shape[0]) < num_points, component, table.shape[0])
+    own = jnp.broadcast_to(_own_row(xy, height, in_slab), (*row.shape, NUM_COLUMNS))
+    greatest, total = table.at[row].max(own, mode="drop"), table.at[row].add(own, mode="drop")
+    return jnp.concatenate([greatest[:, :NUM_BOUNDS], total[:, NUM_BOUNDS:]], axis=1)
 
 
-def _reach(x: jax.Array, y: jax.Array, height: jax.Array) -> jax.Array:
-    """(..., 8) what a point adds to `Statistics.upper`."""
-    columns = [x, y, height, -x, -y, -height]
-    return jnp.stack(columns + columns[-1:] * (NUM_BOUNDS - len(columns)), axis=-1)
+def _own_row(xy: jax.Array, height: jax.Array, in_slab: jax.Array) -> jax.Array:
+    """(..., 8) the table's row of a point alone. Chosen column by column, as a stack does not vectorise."""
+    x, y = xy[..., 0], xy[..., 1]
+    values = [x, y, height, -x, -y, -height, jnp.ones_like(height), in_slab.astype(jnp.float32)]
+    column = np.arange(NUM_COLUMNS)
+    row = values[-1][..., None]
+    for k, value in enumerate(values[:-1]):
+        row = jnp.where(column == k, value[..., None], row)
+    return row
+
+
+def _joined(row: jax.Array, other: jax.Array) -> jax.Array:
+    return jnp.where(np.arange(NUM_COLUMNS) < NUM_BOUNDS, jnp.maximum(row, other), row + other)
 
 
 def select_clusters(
@@ -131,7 +148,7 @@ def select_clusters(
       The clusters, in the order of the components.
     """
     capacity = sum(max_clusters)
-    upper, num_points = statistics.upper, statistics.count[:, 0]
+    upper, num_points = statistics.upper, statistics.num_points
     component = jnp.arange(num_points.shape[0])
     keep = (num_points >= jnp.maximum(min_points, 1)) & (component >= first[0]) & (component < first[-1])
     extent_x, extent_y = upper[:, 0] + upper[:, 3], upper[:, 1] + upper[:, 4]
@@ -152,7 +169,7 @@ def select_clusters(
     return Clusters(
         row=row,
         num_points=take(num_points, member),
-        num_slab=take(statistics.count[:, 1], member),
+        num_slab=take(statistics.num_slab, member),
         low=-upper[:, 3:6],
         high=upper[:, :3],
         found=found,

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxbox.geometry import rectangle_iou
 from jaxbox.grouping import sort_by_group
-from jaxbox.masked import WORD_BITS, map_rows, prefix_sum
+from jaxbox.masked import WORD_BITS, map_rows, prefix_max, prefix_sum
 
 NEARBY_CELL_M = 1.0
 """Points are looked up by cells of this size."""
@@ -191,7 +192,7 @@ def _count_runs(
         present = (num_blocks > 0) & (end > place[0]) & (begin <= place[-1])
         at = jnp.where(present, jnp.maximum(begin - place[0], 0), LOOKUP_BLOCKS)
         run = jnp.zeros(LOOKUP_BLOCKS, jnp.int32).at[at].max(jnp.arange(end.shape[0]), mode="drop")
-        run = jax.lax.cummax(run)
+        run = prefix_max(run)
         offset = (place - begin[run]) * BLOCK_POINTS
         left = jnp.where(place < end[-1], length[run] - offset, 0)
         box = run // runs
@@ -253,7 +254,9 @@ def _judge(
 
 def _top(highest: jax.Array, num_stray: jax.Array, levels: jax.Array, max_height: jax.Array) -> jax.Array:
     """(P,) the height that so many points exceed, evenly spread within their level (P, levels)."""
-    higher = jnp.cumsum(levels[:, ::-1], axis=1)[:, ::-1] - levels
+    # A product is one kernel, a cumulative sum several (XLA, CPU); sums of whole numbers are exact.
+    beyond = np.tri(NUM_LEVELS, k=-1, dtype=np.float32)
+    higher = jnp.dot(levels, beyond, precision=jax.lax.Precision.HIGHEST)
     num_stray = num_stray[:, None]
     is_top = (higher <= num_stray) & (num_stray < higher + levels)
     above = jnp.arange(NUM_LEVELS, 0, -1) - 1 + (num_stray - higher) / jnp.maximum(levels, 1)
@@ -404,13 +407,18 @@ def suppress(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | flo
     """
     rivals = _overlaps(boxes, jnp.sum(valid), max_overlap)[: valid.shape[0]]
 
+    def without_rivals(keep: jax.Array) -> jax.Array:
+        return valid & ~jnp.any((rivals & keep) != 0, axis=1)
+
     def step(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         _, keep = state
-        return keep, valid & ~jnp.any((rivals & _pack(keep)) != 0, axis=1)
+        return keep, _pack(without_rivals(keep))
 
     # A box depends on better ones only: after k rounds the first k are right, and where nothing changes all
     # are. A few rounds do: chains of boxes that overlap one after the other are short.
-    return jax.lax.while_loop(lambda s: jnp.any(s[0] != s[1]), step, (jnp.zeros_like(valid), valid))[1]
+    every = _pack(valid)
+    init = jnp.zeros_like(every), every
+    return without_rivals(jax.lax.while_loop(lambda s: jnp.any(s[0] != s[1]), step, init)[1])
 
 
 def _overlaps(boxes: jax.Array, num_boxes: jax.Array, max_overlap: jax.Array | float) -> jax.Array:

@@ -25,6 +25,16 @@ def test_prefix_sum_is_the_cumulative_sum(size, kind):
     np.testing.assert_array_equal(total, np.cumsum(values))
 
 
+@pytest.mark.parametrize("platform", ["cpu", "default"])
+@pytest.mark.parametrize("size", SIZES)
+def test_prefix_sum_and_prefix_max_are_those_of_numpy_on_every_platform(size, platform, monkeypatch):
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[platform](*args))
+    values = np.random.default_rng(size).integers(0, 99, size)
+    np.testing.assert_array_equal(masked.prefix_sum(jnp.asarray(values)), np.cumsum(values))
+    np.testing.assert_array_equal(masked.prefix_sum(jnp.asarray(values > 50)), np.cumsum(values > 50))
+    np.testing.assert_array_equal(masked.prefix_max(jnp.asarray(values)), np.maximum.accumulate(values))
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_compact_lists_the_true_entries_in_order_and_then_the_sentinel(size):
     for density in (0.0, 0.3, 1.0):

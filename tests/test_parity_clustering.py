@@ -69,9 +69,10 @@ def test_statistics_are_those_of_the_first_points_on_every_platform(platform, nu
     for i in range(81):
         member = (component == i)[:, :num_points].any(axis=0)
         own = xyz[:num_points][member]
-        assert statistics.count[i].tolist() == [len(own), in_slab[:num_points][member].sum()]
+        counts = len(own), in_slab[:num_points][member].sum()
+        assert (statistics.num_points[i], statistics.num_slab[i]) == counts
         bounds = np.concatenate([own.max(axis=0, initial=-np.inf), (-own).max(axis=0, initial=-np.inf)])
-        np.testing.assert_array_equal(statistics.upper[i, :6], bounds)
+        np.testing.assert_array_equal(statistics.upper[i], bounds)
 
 
 def test_warped_points_are_those_of_the_reference(cases):
@@ -139,9 +140,12 @@ SHAPES = {
 }
 
 
+@pytest.mark.parametrize("platform", ["cpu", "default"])
 @pytest.mark.parametrize("name", SHAPES)
-def test_components_of_random_grids_are_those_of_scipy(name):
+def test_components_of_random_grids_are_those_of_scipy_on_every_platform(name, platform, monkeypatch):
     # From single cells to one component, past the density at which paths are longest.
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[platform](*args))
+    label = jax.jit(label_cells.__wrapped__, static_argnames=("row", "max_runs"))
     rng = np.random.default_rng(0)
     row = clustering.CellRow(SHAPES[name])
     size = max(np.prod(shape) for shape in SHAPES[name])
@@ -149,7 +153,7 @@ def test_components_of_random_grids_are_those_of_scipy(name):
         grids = [rng.random(shape) < density for shape in SHAPES[name]]
         where = [rng.permutation(np.argwhere(grid)) for grid in grids]
         cells = np.stack([parity.pad(in_row(c, row, i), size) for i, c in enumerate(where)])
-        component, components = label_cells(cells, row=row, max_runs=MAX_RUNS)
+        component, components = label(cells, row=row, max_runs=MAX_RUNS)
         for i, grid in enumerate(grids):
             labels = np.zeros(grid.shape, np.int32)
             ndimage.label(grid, np.ones((3, 3, 3)), output=labels)
@@ -158,6 +162,29 @@ def test_components_of_random_grids_are_those_of_scipy(name):
             labels[grid] = np.argsort(np.argsort(place))[number]
             expected = int(components.first[i]) + labels[tuple(where[i].T)]
             np.testing.assert_array_equal(np.asarray(component)[i, : len(expected)], expected)
+
+
+def num_native_loops(function, *args, **options):
+    args = jax.tree.map(lambda a: jax.device_put(a, jax.devices("cpu")[0]), args)
+    return function.lower(*args, **options).compile().as_text().count('xla_cpu_small_call="true"')
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_a_cpu_joins_runs_in_native_loops(name):
+    # A loop whose step reads and writes too much for XLA to call it small takes a hundred times as long.
+    row = clustering.CellRow(SHAPES[name])
+    cells = jnp.zeros((len(row.shapes), 9), jnp.int32)
+    kinds = 2 * max(map(len, row.lines_back))
+    assert num_native_loops(label_cells, cells, row=row, max_runs=MAX_RUNS) >= kinds + 1
+
+
+@pytest.mark.parametrize("num_maps", [1, 4, 5, 9])
+def test_a_cpu_finds_statistics_in_native_loops(num_maps):
+    find = jax.jit(selection.find_statistics, static_argnames="max_components")
+    component = jnp.zeros((num_maps, 9), jnp.int32)
+    points = component, jnp.int32(9), jnp.zeros((9, 2)), jnp.zeros(9), jnp.zeros(9, bool)
+    loops = num_native_loops(find, *points, max_components=MAX_RUNS)
+    assert loops == -(-num_maps // selection.MAPS_PER_LOOP)
 
 
 def test_runs_beyond_the_capacity_belong_to_no_component():

@@ -60,7 +60,7 @@ def conclude(
         ground_mask=sweep.inlier & (heights.height <= config.ground.min_height_m),
         point_component=nowhere.at[obstacles.row].set(proposals.component, mode="drop"),
         point_detection=_claim_points(nowhere, asked, owner, num_asked, obstacles, valid.shape[0]),
-        status=_status(counts, sweep, heights, obstacles, proposals, config),
+        status=_status(cloud, counts, heights, obstacles, proposals, config),
         counts=counts,
     )
 
@@ -181,24 +181,24 @@ def _counts(
 
 
 def _status(
+    cloud: PointCloud,
     counts: Counts,
-    sweep: Sweep,
     heights: Heights,
     obstacles: Obstacles,
     proposals: Proposals,
     config: DetectorConfig,
 ) -> jax.Array:
     settings = config.vehicles
-    capacity = sweep.xyz.shape[0]
+    not_valid = counts.dropped_points + counts.nonfinite_points + counts.out_of_range_points
     max_clusters = jnp.array([m.max_clusters for m in config.clustering.maps])
     max_cells = jnp.array([m.max_cells for m in config.clustering.maps])
     bits = {
-        Status.EMPTY: ~jnp.any(sweep.valid),
+        Status.EMPTY: cloud.num_points == not_valid,
         Status.NONFINITE_POINTS: counts.nonfinite_points > 0,
         Status.POINT_OVERFLOW: counts.dropped_points > 0,
         Status.NO_GROUND: ~heights.plane.found,
         Status.OBSTACLE_OVERFLOW: (counts.dropped_obstacles > 0)
-        | ((config.box.fit_to == "slab") & (counts.slab_points > max_slab_points(capacity, config))),
+        | ((config.box.fit_to == "slab") & (counts.slab_points > max_slab_points(cloud.capacity, config))),
         Status.CELL_OVERFLOW: jnp.any(counts.cells > max_cells),
         Status.CLUSTER_OVERFLOW: jnp.any(counts.clusters > max_clusters)
         | (counts.large_clusters > settings.max_large),

@@ -293,7 +293,7 @@ def _in_order_of_size(
     """
     band = jnp.minimum(num_points * NUM_BANDS // max_points, NUM_BANDS - 1)
     # Stored, or each word of flags would work it out bit by bit.
-    possible, band = store((possible, band), jnp.all(num_points >= 0))
+    possible, band = store((possible, band), num_points[0] >= 0)
     flags = possible & (band == jnp.arange(NUM_BANDS)[::-1, None, None])
     index, num = compact(flags.reshape(-1), possible.size)
     return jnp.where(index < flags.size, index % possible.size, possible.size), num
