@@ -264,6 +264,7 @@ def _place(cell: jax.Array, num_strips: int) -> Place:
 
 def _read(values: jax.Array, index: jax.Array) -> jax.Array:
     if index.ndim == 0:
+        # Within a loop: what it reads is known to be one number, so that the loop stays native.
         return values.at[index].get(mode="promise_in_bounds")
     return jnp.take(values, index, mode="clip")
 
@@ -335,16 +336,17 @@ def _join_one_by_one(row: CellRow, runs: _Runs) -> jax.Array:
         is_set = _is_set(runs.words, place)
         if is_before:
             is_set = is_set | _is_set(runs.after, place)
+        other = _run_at(runs.starts, runs.before, place)
 
         def hook(_: jax.Array, above: jax.Array) -> jax.Array:
-            other = _run_at(runs.starts, runs.before, place)
             ends = root_of(node, above), root_of(other, above)
             low = jnp.minimum(*ends)
             # The node itself, too, so that its way to the root is short.
             return hang(hang(above, jnp.maximum(*ends), low), node, low)
 
         # A conditional would copy all that is above.
-        return jax.lax.fori_loop(0, (is_set & (node > NONE)).astype(jnp.int32), hook, above)
+        is_link = is_set & (node > NONE) & (other < runs.num)
+        return jax.lax.fori_loop(0, is_link.astype(jnp.int32), hook, above)
 
     size = runs.cell.shape[0]
     num = jnp.minimum(runs.num, size)
@@ -367,7 +369,8 @@ def _join_in_rounds(row: CellRow, runs: _Runs) -> jax.Array:
     before, behind = store(jax.tree.map(place, _beside(row, runs.cell)), runs.num >= 0)
 
     def link(bits: jax.Array, at: Place) -> jax.Array:
-        return jnp.where(present & _is_set(bits, at), _run_at(runs.starts, runs.before, at), itself)
+        other = _run_at(runs.starts, runs.before, at)
+        return jnp.where(present & _is_set(bits, at) & (other < num_nodes), other, itself)
 
     links = [link(runs.words | runs.after, at) for at in before]
     parent, *links = links + [link(runs.words, at) for at in behind]

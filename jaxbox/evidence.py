@@ -131,7 +131,7 @@ def build_evidence(
     """
     rho = jnp.sqrt(xyz[:, 0] ** 2 + xyz[:, 1] ** 2)
     seen = mask & (rho >= min_range_m)
-    # Stored, or each scatter would work it out again.
+    # Stored, or each scatter would work it out again. The proof holds of what is not a number, too.
     azimuth = store(azimuth_cell(_arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths), ~(rho[0] < 0))
     num_blocks = num_ranges // BLOCK + 1
     size = num_blocks * BLOCK * num_azimuths

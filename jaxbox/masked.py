@@ -15,7 +15,7 @@ import numpy as np
 from jaxbox.devices import at_a_time
 
 BLOCK = 512
-"""Columns of sums in two levels: XLA's cumulative sum slows down with its length."""
+"""Columns of sums in two levels; a sum of so many flags fits the bits that `count_true` gives it."""
 
 PREFIX_UNROLL = 4
 """Numbers taken in one step of the loop of a prefix sum: twice as fast as one."""
@@ -54,7 +54,7 @@ def prefix_sum(values: jax.Array) -> jax.Array:
     >>> prefix_sum(jnp.array([1, 0, 2])).tolist()
     [1, 1, 3]
     """
-    one_by_one = functools.partial(_fold_one_by_one, jnp.add)
+    one_by_one = functools.partial(_scan_one_by_one, jnp.add)
     return jax.lax.platform_dependent(values, cpu=one_by_one, default=_sum_in_blocks)
 
 
@@ -70,16 +70,16 @@ def prefix_max(values: jax.Array) -> jax.Array:
     >>> prefix_max(jnp.array([1, 0, 2])).tolist()
     [1, 1, 2]
     """
-    one_by_one = functools.partial(_fold_one_by_one, jnp.maximum)
+    one_by_one = functools.partial(_scan_one_by_one, jnp.maximum)
     return jax.lax.platform_dependent(values, cpu=one_by_one, default=jax.lax.cummax)
 
 
-def _fold_one_by_one(add: Callable[..., jax.Array], values: jax.Array) -> jax.Array:
+def _scan_one_by_one(combine: Callable[..., jax.Array], values: jax.Array) -> jax.Array:
     """Number after number: XLA compiles so small a loop to native code on the CPU."""
 
     def step(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         total, totals = state
-        total = add(total, values[i].astype(jnp.int32))
+        total = combine(total, values[i].astype(jnp.int32))
         return total, totals.at[i].set(total, mode="promise_in_bounds")
 
     init = jnp.int32(0), jnp.zeros(values.shape, jnp.int32)
@@ -102,7 +102,7 @@ def _count_before(mask: jax.Array) -> jax.Array:
     bit = jnp.arange(WORD_BITS, dtype=jnp.uint32)
     words = _words(mask)
     population = jax.lax.population_count(words).astype(jnp.int32)
-    before = prefix_sum(population) - population
+    before = _sum_in_blocks(population) - population
     up_to = (jnp.uint32(2) << bit) - 1
     inside = jax.lax.population_count(words[:, None] & up_to).astype(jnp.int32)
     return (before[:, None] + inside).reshape(-1)[:size]

@@ -17,6 +17,9 @@ NUM_COLUMNS = 8
 NUM_BOUNDS = 6
 """Columns that hold a maximum; the others, a sum."""
 
+IS_BOUND = np.arange(NUM_COLUMNS) < NUM_BOUNDS
+"""Which columns hold a maximum."""
+
 MAPS_PER_LOOP = 4
 """Maps gone through in one native loop: with too much to do in a step, it would not be native any more."""
 
@@ -68,8 +71,8 @@ def find_statistics(
     Returns:
       The statistics; no points, and bounds of minus infinity, where there are none.
     """
-    is_bound = np.arange(NUM_COLUMNS) < NUM_BOUNDS
-    none = jnp.broadcast_to(jnp.where(is_bound, -jnp.inf, 0), (max_components, NUM_COLUMNS))
+    num_points = jnp.minimum(num_points, height.shape[0])
+    none = jnp.broadcast_to(jnp.where(IS_BOUND, -jnp.inf, 0), (max_components, NUM_COLUMNS))
     points = xy, height, in_slab
     return Statistics(
         jax.lax.platform_dependent(
@@ -106,8 +109,11 @@ def _add_at_once(table: jax.Array, component: jax.Array, num_points: jax.Array, 
     xy, height, in_slab = points
     row = jnp.where(jnp.arange(height.shape[0]) < num_points, component, table.shape[0])
     own = jnp.broadcast_to(_own_row(xy, height, in_slab), (*row.shape, NUM_COLUMNS))
-    greatest, total = table.at[row].max(own, mode="drop"), table.at[row].add(own, mode="drop")
-    return jnp.concatenate([greatest[:, :NUM_BOUNDS], total[:, NUM_BOUNDS:]], axis=1)
+    bounds = table[:, :NUM_BOUNDS].at[row].max(own[..., :NUM_BOUNDS], mode="drop")
+    # Whole numbers: ordered scatters of floats cost accelerators more.
+    counts = jnp.zeros((table.shape[0], NUM_COLUMNS - NUM_BOUNDS), jnp.int32)
+    counts = counts.at[row].add(own[..., NUM_BOUNDS:].astype(jnp.int32), mode="drop")
+    return jnp.concatenate([bounds, counts.astype(jnp.float32)], axis=1)
 
 
 def _own_row(xy: jax.Array, height: jax.Array, in_slab: jax.Array) -> jax.Array:
@@ -122,7 +128,7 @@ def _own_row(xy: jax.Array, height: jax.Array, in_slab: jax.Array) -> jax.Array:
 
 
 def _joined(row: jax.Array, other: jax.Array) -> jax.Array:
-    return jnp.where(np.arange(NUM_COLUMNS) < NUM_BOUNDS, jnp.maximum(row, other), row + other)
+    return jnp.where(IS_BOUND, jnp.maximum(row, other), row + other)
 
 
 def select_clusters(

@@ -10,29 +10,31 @@ from jaxbox import grouping, masked
 SIZES = (1, 2, masked.BLOCK - 1, masked.BLOCK, masked.BLOCK + 1, 3 * masked.BLOCK + 7)
 
 # Compiled whole: run step by step, each step of each size would compile alone.
-prefix_sum = jax.jit(masked.prefix_sum)
 compact = jax.jit(masked.compact, static_argnums=1)
 group_by = jax.jit(grouping.group_by, static_argnums=1)
-
-
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("kind", ["bool", "int32"])
-def test_prefix_sum_is_the_cumulative_sum(size, kind):
-    rng = np.random.default_rng(size)
-    values = rng.integers(0, 2, size).astype(bool) if kind == "bool" else rng.integers(-9, 9, size)
-    total = prefix_sum(jnp.asarray(values, kind))
-    assert total.dtype == jnp.int32
-    np.testing.assert_array_equal(total, np.cumsum(values))
 
 
 @pytest.mark.parametrize("platform", ["cpu", "default"])
 @pytest.mark.parametrize("size", SIZES)
 def test_prefix_sum_and_prefix_max_are_those_of_numpy_on_every_platform(size, platform, monkeypatch):
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[platform](*args))
-    values = np.random.default_rng(size).integers(0, 99, size)
-    np.testing.assert_array_equal(masked.prefix_sum(jnp.asarray(values)), np.cumsum(values))
-    np.testing.assert_array_equal(masked.prefix_sum(jnp.asarray(values > 50)), np.cumsum(values > 50))
-    np.testing.assert_array_equal(masked.prefix_max(jnp.asarray(values)), np.maximum.accumulate(values))
+    values = np.random.default_rng(size).integers(-9, 9, size)
+    for of in (values, values > 0):
+        total = masked.prefix_sum(jnp.asarray(of))
+        assert total.dtype == jnp.int32
+        np.testing.assert_array_equal(total, np.cumsum(of))
+    greatest = masked.prefix_max(jnp.asarray(abs(values)))
+    np.testing.assert_array_equal(greatest, np.maximum.accumulate(abs(values)))
+
+
+@pytest.mark.parametrize(
+    "toolbox", [masked.prefix_sum, masked.prefix_max, lambda m: masked.compact(m > 0, 9)]
+)
+def test_a_cpu_runs_the_toolbox_in_native_loops(toolbox):
+    # A loop whose step does too much for XLA to call it small takes a hundred times as long.
+    values = jax.device_put(jnp.zeros(1000, jnp.int32), jax.devices("cpu")[0])
+    text = jax.jit(toolbox).lower(values).compile().as_text()
+    assert text.count('xla_cpu_small_call="true"') == text.count(" while(") == 1
 
 
 @pytest.mark.parametrize("size", SIZES)

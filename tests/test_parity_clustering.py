@@ -57,7 +57,7 @@ def members_of(case, component_map):
 
 
 @pytest.mark.parametrize("platform", ["cpu", "default"])
-@pytest.mark.parametrize("num_points", [0, 1, 700, 1000])
+@pytest.mark.parametrize("num_points", [0, 1, 700, 1000, 1200])
 def test_statistics_are_those_of_the_first_points_on_every_platform(platform, num_points, monkeypatch):
     rng = np.random.default_rng(num_points)
     component = rng.integers(0, 40, (2, 1000), np.int32)
@@ -164,9 +164,11 @@ def test_components_of_random_grids_are_those_of_scipy_on_every_platform(name, p
             np.testing.assert_array_equal(np.asarray(component)[i, : len(expected)], expected)
 
 
-def num_native_loops(function, *args, **options):
+def count_loops(function, *args, **options):
+    """Loops of the program for a CPU, and how many of them are native code."""
     args = jax.tree.map(lambda a: jax.device_put(a, jax.devices("cpu")[0]), args)
-    return function.lower(*args, **options).compile().as_text().count('xla_cpu_small_call="true"')
+    text = function.lower(*args, **options).compile().as_text()
+    return text.count(" while("), text.count('xla_cpu_small_call="true"')
 
 
 @pytest.mark.parametrize("name", SHAPES)
@@ -174,8 +176,8 @@ def test_a_cpu_joins_runs_in_native_loops(name):
     # A loop whose step reads and writes too much for XLA to call it small takes a hundred times as long.
     row = clustering.CellRow(SHAPES[name])
     cells = jnp.zeros((len(row.shapes), 9), jnp.int32)
-    kinds = 2 * max(map(len, row.lines_back))
-    assert num_native_loops(label_cells, cells, row=row, max_runs=MAX_RUNS) >= kinds + 1
+    num_loops, num_native = count_loops(label_cells, cells, row=row, max_runs=MAX_RUNS)
+    assert num_native == num_loops > 2 * max(map(len, row.lines_back))
 
 
 @pytest.mark.parametrize("num_maps", [1, 4, 5, 9])
@@ -183,8 +185,8 @@ def test_a_cpu_finds_statistics_in_native_loops(num_maps):
     find = jax.jit(selection.find_statistics, static_argnames="max_components")
     component = jnp.zeros((num_maps, 9), jnp.int32)
     points = component, jnp.int32(9), jnp.zeros((9, 2)), jnp.zeros(9), jnp.zeros(9, bool)
-    loops = num_native_loops(find, *points, max_components=MAX_RUNS)
-    assert loops == -(-num_maps // selection.MAPS_PER_LOOP)
+    num_loops, num_native = count_loops(find, *points, max_components=MAX_RUNS)
+    assert num_native == num_loops == -(-num_maps // selection.MAPS_PER_LOOP)
 
 
 def test_runs_beyond_the_capacity_belong_to_no_component():
@@ -195,6 +197,17 @@ def test_runs_beyond_the_capacity_belong_to_no_component():
         component, components = label_cells(cells, row=row, max_runs=capacity)
         assert int(components.num_runs[0]) == 200
         assert (np.asarray(component) == clustering.NONE).sum() == max(201 - capacity, 0)
+
+
+@pytest.mark.parametrize("platform", ["cpu", "default"])
+def test_runs_beyond_the_capacity_join_nothing(platform, monkeypatch):
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[platform](*args))
+    label = jax.jit(label_cells.__wrapped__, static_argnames=("row", "max_runs"))
+    row = clustering.CellRow(((20, 40, 1),))
+    # The third touches the first, and nothing the second.
+    cells = in_row(np.array([[0, 1, 0], [0, 30, 0], [1, 0, 0]], np.int32), row, 0)[None]
+    for capacity, expected in ((4, [1, 2, 1]), (3, [1, 2, 0]), (2, [1, 0, 0])):
+        assert label(cells, row=row, max_runs=capacity)[0].tolist() == [expected]
 
 
 @pytest.mark.parametrize("name", list(MAPS))

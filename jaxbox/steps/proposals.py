@@ -55,7 +55,7 @@ def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Proposals:
     num = obstacles.height.shape[0]
     statistics = selection.find_statistics(
         component[:, :num],
-        jnp.minimum(obstacles.count, num),
+        obstacles.count,
         obstacles.xy,
         obstacles.height,
         _in_slab(obstacles.height, config),
