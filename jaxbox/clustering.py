@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import WORD_BITS, compact, fold_rows, lookup, prefix_sum, store, take
+from jaxbox.masked import WORD_BITS, lookup, prefix_sum, take
 
 STRIP_WORDS = 32
 """R, words of a strip of consecutive cells. The strips lie side by side in tables (R, S), so that sums along
@@ -26,9 +26,6 @@ MAX_STARTS = WORD_BITS // 2
 
 NONE = 0
 """Cell, run and component of points that have none; the others count from 1."""
-
-LINK_CHUNK = 4096
-"""Links between runs that are followed at a time; a sweep of 64 beams has some 1,000 to 14,000."""
 
 
 def warp_range(xy: jax.Array, *, start_m: jax.Array | float, growth: jax.Array | float) -> jax.Array:
@@ -212,10 +209,18 @@ def label_components(flags: jax.Array, row: CellRow, *, max_runs: int) -> Compon
     starts = words & ~after
     runs_before, num_runs = _prefix(_population(starts))
 
-    runs = _Runs(words, after, starts, runs_before, _starting_cells(starts, runs_before, max_runs), num_runs)
-    join = {"cpu": _join_one_by_one, "default": _join_in_rounds}
-    join = {platform: functools.partial(function, row) for platform, function in join.items()}
-    parent = jax.lax.platform_dependent(runs, **join)
+    runs = _Runs(
+        touched=((words | after).reshape(-1), words.reshape(-1)),
+        starts=starts.reshape(-1),
+        before=runs_before.reshape(-1),
+        cell=_starting_cells(starts, runs_before, max_runs),
+        num=jnp.minimum(num_runs, max_runs),
+    )
+    parent = jax.lax.platform_dependent(
+        runs,
+        cpu=functools.partial(_join_one_by_one, row),
+        default=functools.partial(_join_in_rounds, row),
+    )
     itself = jnp.arange(max_runs, dtype=jnp.int32)
     number = prefix_sum((parent == itself) & (itself < num_runs)) - 1
     first_run = jnp.append(runs_before[0, jnp.array(row.starts[:-1]) // STRIP], num_runs)
@@ -262,23 +267,16 @@ def _place(cell: jax.Array, num_strips: int) -> Place:
     return word * num_strips + strip, (cell & (WORD_BITS - 1)).astype(jnp.uint32)
 
 
-def _read(values: jax.Array, index: jax.Array) -> jax.Array:
-    if index.ndim == 0:
-        # Within a loop: what it reads is known to be one number, so that the loop stays native.
-        return values.at[index].get(mode="promise_in_bounds")
-    return jnp.take(values, index, mode="clip")
-
-
 def _is_set(words: jax.Array, place: Place) -> jax.Array:
     word, bit = place
-    return _read(words, word) >> bit & 1 == 1
+    return jnp.take(words, word, mode="clip") >> bit & 1 == 1
 
 
 def _run_at(starts: jax.Array, runs_before: jax.Array, place: Place) -> jax.Array:
     """The last run that starts at a cell or before it."""
     word, bit = place
-    up_to = _read(starts, word) & ((jnp.uint32(2) << bit) - 1)
-    return _read(runs_before, word) + _population(up_to) - 1
+    up_to = jnp.take(starts, word, mode="clip") & ((jnp.uint32(2) << bit) - 1)
+    return jnp.take(runs_before, word, mode="clip") + _population(up_to) - 1
 
 
 def _starting_cells(starts: jax.Array, runs_before: jax.Array, size: int) -> jax.Array:
@@ -298,17 +296,15 @@ def _starting_cells(starts: jax.Array, runs_before: jax.Array, size: int) -> jax
     return cell + _population((bits & -bits) - 1)
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class _Runs:
-    """The nodes: runs of occupied cells along a line."""
-
-    words: jax.Array  # (R, S) uint32, bits of the occupied cells
-    after: jax.Array  # (R, S) uint32, of those one further on
-    starts: jax.Array  # (R, S) uint32, of those that start a run
-    before: jax.Array  # (R, S) int32, runs that start before each word
-    cell: jax.Array  # (C,) int32, at which each run starts
-    num: jax.Array  # () int32, may exceed C
+def _by_map(row: CellRow, cell: jax.Array) -> list[jax.Array]:
+    """`CellRow.lines_back` at each cell; 0, which leads to the cell itself, where its map has fewer lines."""
+    steps = []
+    for back in itertools.zip_longest(*row.lines_back, fillvalue=0):
+        step = jnp.full_like(cell, back[0])
+        for start, other in zip(row.starts[1:-1], back[1:], strict=True):
+            step = jnp.where(cell >= start, other, step)
+        steps.append(step)
+    return steps
 
 
 def _beside(row: CellRow, cell: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
@@ -321,79 +317,77 @@ def _beside(row: CellRow, cell: jax.Array) -> tuple[list[jax.Array], list[jax.Ar
     return [cell - b for b in back], [cell + b - 1 for b in back]
 
 
-def _join_one_by_one(row: CellRow, runs: _Runs) -> jax.Array:
-    """Union-find, link after link: XLA compiles so small loops to native code on the CPU."""
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class _Runs:
+    """Runs of occupied cells along a line: the nodes of the graph whose components are sought."""
 
-    def root_of(node: jax.Array, above: jax.Array) -> jax.Array:
-        return jax.lax.while_loop(lambda i: _read(above, i) != i, lambda i: _read(above, i), node)
+    touched: tuple[jax.Array, jax.Array]  # (R S,) uint32, bits to look at on lines before, and on lines after
+    starts: jax.Array  # (R S,) uint32, bits of the cells at which runs start
+    before: jax.Array  # (R S,) int32, runs that start before each word
+    cell: jax.Array  # (C,) int32, at which each run starts
+    num: jax.Array  # () int32, at most C
 
-    def hang(above: jax.Array, node: jax.Array, root: jax.Array) -> jax.Array:
-        return above.at[node].set(root, mode="promise_in_bounds")
-
-    def join(is_before: bool, k: int, node: jax.Array, above: jax.Array) -> jax.Array:
-        cell = _beside(row, _read(runs.cell, node))[not is_before][k]
+    def look(self, row: CellRow, side: int, cell: jax.Array, node: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Whether a run that each node touches lies at the cell, on that side of its line, and which."""
         place = _place(cell, row.num_strips)
-        is_set = _is_set(runs.words, place)
-        if is_before:
-            is_set = is_set | _is_set(runs.after, place)
-        other = _run_at(runs.starts, runs.before, place)
+        other = _run_at(self.starts, self.before, place)
+        exist = (node > NONE) & (node < self.num) & (other < self.num)
+        return exist & _is_set(self.touched[side], place), other
 
-        def hook(_: jax.Array, above: jax.Array) -> jax.Array:
-            ends = root_of(node, above), root_of(other, above)
+
+def _join_one_by_one(row: CellRow, runs: _Runs) -> jax.Array:
+    """(C,) int32: the lowest node of each node's component, by a union-find, link after link.
+
+    XLA compiles so small loops to native code on the CPU.
+    """
+
+    def find_root(node: jax.Array, parent: jax.Array) -> jax.Array:
+        return jax.lax.while_loop(lambda i: lookup(parent, i) != i, lambda i: lookup(parent, i), node)
+
+    def set_parent(parent: jax.Array, node: jax.Array, root: jax.Array) -> jax.Array:
+        return parent.at[node].set(root, mode="promise_in_bounds")
+
+    def join(side: int, k: int, node: jax.Array, parent: jax.Array) -> jax.Array:
+        cell = _beside(row, lookup(runs.cell, node))[side][k]
+        touches, other = runs.look(row, side, cell, node)
+
+        def unite(_: jax.Array, parent: jax.Array) -> jax.Array:
+            ends = find_root(node, parent), find_root(other, parent)
             low = jnp.minimum(*ends)
             # The node itself, too, so that its way to the root is short.
-            return hang(hang(above, jnp.maximum(*ends), low), node, low)
+            return set_parent(set_parent(parent, jnp.maximum(*ends), low), node, low)
 
-        # A conditional would copy all that is above.
-        is_link = is_set & (node > NONE) & (other < runs.num)
-        return jax.lax.fori_loop(0, is_link.astype(jnp.int32), hook, above)
+        # A conditional would copy all parents.
+        return jax.lax.fori_loop(0, touches.astype(jnp.int32), unite, parent)
 
-    size = runs.cell.shape[0]
-    num = jnp.minimum(runs.num, size)
-    flat = [jnp.reshape(words, -1) for words in (runs.words, runs.after, runs.starts, runs.before)]
-    runs = _Runs(*flat, cell=runs.cell, num=num)
-    above = jnp.arange(size, dtype=jnp.int32)
-    for is_before in (True, False):
+    parent = jnp.arange(runs.cell.shape[0], dtype=jnp.int32)
+    for side in range(2):
         for k in range(max(map(len, row.lines_back))):
-            above = jax.lax.fori_loop(0, num, functools.partial(join, is_before, k), above)
-    return jax.lax.fori_loop(0, num, lambda i, above: hang(above, i, root_of(i, above)), above)
+            parent = jax.lax.fori_loop(0, runs.num, functools.partial(join, side, k), parent)
+    return jax.lax.fori_loop(0, runs.num, lambda i, p: set_parent(p, i, find_root(i, p)), parent)
 
 
 def _join_in_rounds(row: CellRow, runs: _Runs) -> jax.Array:
-    """The first kind of link makes a forest; its trees hook onto lower ones over the others."""
-    num_nodes = runs.cell.shape[0]
-    itself = jnp.arange(num_nodes, dtype=jnp.int32)
-    present = (itself > NONE) & (itself < runs.num)
-    # Stored, since what a look-up has to work out first does not vectorise.
-    place = functools.partial(_place, num_strips=row.num_strips)
-    before, behind = store(jax.tree.map(place, _beside(row, runs.cell)), runs.num >= 0)
+    """As `_join_one_by_one`, all links at once.
 
-    def link(bits: jax.Array, at: Place) -> jax.Array:
-        other = _run_at(runs.starts, runs.before, at)
-        return jnp.where(present & _is_set(bits, at) & (other < num_nodes), other, itself)
+    The first kind of link makes a forest; its trees hook onto lower ones over the others.
+    """
+    itself = jnp.arange(runs.cell.shape[0], dtype=jnp.int32)
 
-    links = [link(runs.words | runs.after, at) for at in before]
-    parent, *links = links + [link(runs.words, at) for at in behind]
-    links = store(links, parent[NONE] >= 0)
-    ends = jnp.concatenate(links)
-    # Few nodes have a link of every kind: those that there are make a list.
-    listed, num = compact(ends != jnp.tile(jnp.arange(num_nodes), len(links)), ends.shape[0])
+    def link(side: int, cell: jax.Array) -> jax.Array:
+        touches, other = runs.look(row, side, cell, itself)
+        return jnp.where(touches, other, itself)
 
-    def hook_chunk(
-        state: tuple[jax.Array, jax.Array], _: jax.Array, link: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        root, moved = state
-        # Beyond the last link stands the node of no cell, and its end.
-        pair = lookup(root, link % num_nodes), lookup(root, take(ends, link, NONE))
-        low, high = jnp.minimum(*pair), jnp.maximum(*pair)
-        return root.at[high].min(low), moved | jnp.any(low < high)
+    sides = enumerate(_beside(row, runs.cell))
+    parent, *links = [link(side, cell) for side, cells in sides for cell in cells]
+    node, other = jnp.tile(itself, len(links)), jnp.concatenate(links)
 
     def hook(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        start = state[0], jnp.bool_(False)
-        root, moved = fold_rows(
-            hook_chunk, start, listed, num_rows=num, chunk=LINK_CHUNK, absent=ends.shape[0]
-        )
-        return _jump(root), moved
+        root, _ = state
+        pair = lookup(root, node), lookup(root, other)
+        low, high = jnp.minimum(*pair), jnp.maximum(*pair)
+        return _jump(root.at[high].min(low)), jnp.any(low < high)
 
     return jax.lax.while_loop(lambda state: state[1], hook, (_jump(parent), jnp.bool_(True)))[0]
 
@@ -408,14 +402,3 @@ def _jump(parent: jax.Array) -> jax.Array:
         return higher, jnp.any(higher != parent)
 
     return jax.lax.while_loop(lambda state: state[1], jump, (parent, jnp.bool_(True)))[0]
-
-
-def _by_map(row: CellRow, cell: jax.Array) -> list[jax.Array]:
-    """`CellRow.lines_back` at each cell; 0, which leads to the cell itself, where its map has fewer lines."""
-    steps = []
-    for back in itertools.zip_longest(*row.lines_back, fillvalue=0):
-        step = jnp.full_like(cell, back[0])
-        for start, other in zip(row.starts[1:-1], back[1:], strict=True):
-            step = jnp.where(cell >= start, other, step)
-        steps.append(step)
-    return steps

@@ -254,8 +254,8 @@ def _judge(
 
 def _top(highest: jax.Array, num_stray: jax.Array, levels: jax.Array, max_height: jax.Array) -> jax.Array:
     """(P,) the height that so many points exceed, evenly spread within their level (P, levels)."""
-    # A product is one kernel, a cumulative sum several (XLA, CPU). Whole numbers are
-    # exact, if no accelerator rounds them first.
+    # A product is one kernel, a cumulative sum several (XLA, CPU). It is exact of whole numbers, unless
+    # an accelerator rounds them first.
     beyond = np.tri(NUM_LEVELS, k=-1, dtype=np.float32)
     higher = jnp.dot(levels, beyond, precision=jax.lax.Precision.HIGHEST)
     num_stray = num_stray[:, None]

@@ -53,3 +53,11 @@ def cases(request: pytest.FixtureRequest) -> tuple[parity.Case, ...]:
     if request.param == "synthetic":
         return parity.synthetic_cases()
     return parity.real_cases(request.getfixturevalue("data_root"))
+
+
+@pytest.fixture(params=["cpu", "default"])
+def platform(request, monkeypatch):
+    """Either form of what is done otherwise on a CPU, whatever the tests run on."""
+    branch = request.param
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[branch](*args))
+    return branch

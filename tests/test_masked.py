@@ -14,27 +14,34 @@ compact = jax.jit(masked.compact, static_argnums=1)
 group_by = jax.jit(grouping.group_by, static_argnums=1)
 
 
-@pytest.mark.parametrize("platform", ["cpu", "default"])
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("size", SIZES)
-def test_prefix_sum_and_prefix_max_are_those_of_numpy_on_every_platform(size, platform, monkeypatch):
-    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[platform](*args))
+def test_prefix_sum_and_prefix_max_are_those_of_numpy_on_every_platform(size):
     values = np.random.default_rng(size).integers(-9, 9, size)
-    for of in (values, values > 0):
-        total = masked.prefix_sum(jnp.asarray(of))
-        assert total.dtype == jnp.int32
-        np.testing.assert_array_equal(total, np.cumsum(of))
-    greatest = masked.prefix_max(jnp.asarray(abs(values)))
+    total, num_positive, greatest = jax.jit(
+        lambda v: (masked.prefix_sum(v), masked.prefix_sum(v > 0), masked.prefix_max(abs(v)))
+    )(values)
+    assert total.dtype == num_positive.dtype == jnp.int32
+    np.testing.assert_array_equal(total, np.cumsum(values))
+    np.testing.assert_array_equal(num_positive, np.cumsum(values > 0))
     np.testing.assert_array_equal(greatest, np.maximum.accumulate(abs(values)))
+
+
+def count_loops(function, *args, **options):
+    """Loops of a jitted function's program for a CPU, and how many of them are native code.
+
+    A loop whose step does too much for XLA to call it small takes a hundred times as long.
+    """
+    args = jax.tree.map(lambda a: jax.device_put(a, jax.devices("cpu")[0]), args)
+    text = function.lower(*args, **options).compile().as_text()
+    return text.count(" while("), text.count('xla_cpu_small_call="true"')
 
 
 @pytest.mark.parametrize(
     "toolbox", [masked.prefix_sum, masked.prefix_max, lambda m: masked.compact(m > 0, 9)]
 )
 def test_a_cpu_runs_the_toolbox_in_native_loops(toolbox):
-    # A loop whose step does too much for XLA to call it small takes a hundred times as long.
-    values = jax.device_put(jnp.zeros(1000, jnp.int32), jax.devices("cpu")[0])
-    text = jax.jit(toolbox).lower(values).compile().as_text()
-    assert text.count('xla_cpu_small_call="true"') == text.count(" while(") == 1
+    assert count_loops(jax.jit(toolbox), jnp.zeros(1000, jnp.int32)) == (1, 1)
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -170,11 +177,10 @@ def test_both_sorts_of_group_by_are_tried_above():
     assert not packed(2**19, 2**12)
 
 
-@pytest.mark.parametrize("platform", ["cpu", "default"])
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("num_rows", [0, 1, 700, 1000])
-def test_sort_by_group_is_a_stable_sort_of_the_first_rows_on_every_platform(platform, num_rows, monkeypatch):
+def test_sort_by_group_is_a_stable_sort_of_the_first_rows_on_every_platform(num_rows):
     group = np.random.default_rng(num_rows).integers(0, 40, 1000)
-    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[platform](*args))
     (rows, minus), begin, end = grouping.sort_by_group(
         lambda i: (i, -i), jnp.asarray(group), jnp.int32(num_rows), 40, room=3
     )

@@ -8,6 +8,7 @@ import numpy as np
 import parity
 import pytest
 from scipy import ndimage
+from test_masked import count_loops
 
 from jaxbox import box, clustering, reference, selection
 from jaxbox.config import ComponentMap, DetectorConfig
@@ -56,14 +57,13 @@ def members_of(case, component_map):
     return case.obstacles.xyz[member, :2].astype(np.float32), height[member].astype(np.float32)
 
 
-@pytest.mark.parametrize("platform", ["cpu", "default"])
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("num_points", [0, 1, 700, 1000, 1200])
-def test_statistics_are_those_of_the_first_points_on_every_platform(platform, num_points, monkeypatch):
+def test_statistics_are_those_of_the_first_points_on_every_platform(num_points):
     rng = np.random.default_rng(num_points)
     component = rng.integers(0, 40, (2, 1000), np.int32)
     component[1] += 40
     xyz, in_slab = rng.normal(size=(1000, 3)).astype(np.float32), rng.random(1000) < 0.5
-    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[platform](*args))
     points = component, jnp.int32(num_points), xyz[:, :2], xyz[:, 2], in_slab
     statistics = selection.find_statistics(*map(jnp.asarray, points), max_components=81)
     for i in range(81):
@@ -140,11 +140,10 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("platform", ["cpu", "default"])
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("name", SHAPES)
-def test_components_of_random_grids_are_those_of_scipy_on_every_platform(name, platform, monkeypatch):
+def test_components_of_random_grids_are_those_of_scipy_on_every_platform(name):
     # From single cells to one component, past the density at which paths are longest.
-    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[platform](*args))
     label = jax.jit(label_cells.__wrapped__, static_argnames=("row", "max_runs"))
     rng = np.random.default_rng(0)
     row = clustering.CellRow(SHAPES[name])
@@ -164,16 +163,8 @@ def test_components_of_random_grids_are_those_of_scipy_on_every_platform(name, p
             np.testing.assert_array_equal(np.asarray(component)[i, : len(expected)], expected)
 
 
-def count_loops(function, *args, **options):
-    """Loops of the program for a CPU, and how many of them are native code."""
-    args = jax.tree.map(lambda a: jax.device_put(a, jax.devices("cpu")[0]), args)
-    text = function.lower(*args, **options).compile().as_text()
-    return text.count(" while("), text.count('xla_cpu_small_call="true"')
-
-
 @pytest.mark.parametrize("name", SHAPES)
 def test_a_cpu_joins_runs_in_native_loops(name):
-    # A loop whose step reads and writes too much for XLA to call it small takes a hundred times as long.
     row = clustering.CellRow(SHAPES[name])
     cells = jnp.zeros((len(row.shapes), 9), jnp.int32)
     num_loops, num_native = count_loops(label_cells, cells, row=row, max_runs=MAX_RUNS)
@@ -199,9 +190,8 @@ def test_runs_beyond_the_capacity_belong_to_no_component():
         assert (np.asarray(component) == clustering.NONE).sum() == max(201 - capacity, 0)
 
 
-@pytest.mark.parametrize("platform", ["cpu", "default"])
-def test_runs_beyond_the_capacity_join_nothing(platform, monkeypatch):
-    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[platform](*args))
+@pytest.mark.usefixtures("platform")
+def test_runs_beyond_the_capacity_join_nothing():
     label = jax.jit(label_cells.__wrapped__, static_argnames=("row", "max_runs"))
     row = clustering.CellRow(((20, 40, 1),))
     # The third touches the first, and nothing the second.
