@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbox.grouping import sort_by_group
-from jaxbox.masked import fold_points, fold_rows, map_rows, rows_in_use, store, take
+from jaxbox.masked import fast_max, fast_min, fold_points, fold_rows, map_rows, rows_in_use, store, take
 from jaxbox.types import Rectangles
 
 CHUNK = 64
@@ -145,7 +145,7 @@ def _extents(clusters: PointTable, cos: jax.Array, sin: jax.Array) -> jax.Array:
     to_x, to_y = jnp.concatenate([-cos, cos, sin, -sin]), jnp.concatenate([-sin, sin, -cos, cos])
 
     def update(reach: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-        return jnp.maximum(reach, _along(x, y, to_x, to_y))
+        return fast_max(reach, _along(x, y, to_x, to_y))
 
     x, y, count = clusters
     # A point that is absent is seen as the first once more; a cluster without any has a first one anyhow.
@@ -181,14 +181,14 @@ def _closeness(
     u0, u1, v0, v1 = extents
 
     def distance(u: jax.Array, v: jax.Array) -> jax.Array:
-        return jnp.minimum(_to_edge(u, u0, u1), _to_edge(v, v0, v1))
+        return fast_min(_to_edge(u, u0, u1), _to_edge(v, v0, v1))
 
     return _mean_closeness(clusters, cos, sin, distance, d0)
 
 
 def _to_edge(u: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
     """Distance to the nearer of two edges, from between them or beyond."""
-    return jnp.minimum(jnp.abs(u - low), jnp.abs(high - u))
+    return fast_min(jnp.abs(u - low), jnp.abs(high - u))
 
 
 def _visible_closeness(
@@ -200,7 +200,7 @@ def _visible_closeness(
     v_near = jnp.where(jnp.abs(v0) < jnp.abs(v1), v0, v1)
 
     def distance(u: jax.Array, v: jax.Array) -> jax.Array:
-        return jnp.minimum(jnp.abs(u - u_near), jnp.abs(v - v_near))
+        return fast_min(jnp.abs(u - u_near), jnp.abs(v - v_near))
 
     return _mean_closeness(clusters, cos, sin, distance, d0)
 
@@ -215,7 +215,7 @@ def _mean_closeness(
     minus_sin = -sin
 
     def update(total: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-        return total + d0 / jnp.maximum(distance(_along(x, y, cos, sin), _along(x, y, minus_sin, cos)), d0)
+        return total + d0 / fast_max(distance(_along(x, y, cos, sin), _along(x, y, minus_sin, cos)), d0)
 
     x, y, count = clusters
     zero = jnp.zeros((cos.shape[0], x.shape[1]))

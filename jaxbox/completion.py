@@ -6,7 +6,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import fold_points
+from jaxbox.masked import fast_max, fast_min, fold_points
 from jaxbox.types import NOT_A_BOX, Boxes, Rectangles
 
 INSIDE_MARGIN_M = 0.1
@@ -291,7 +291,7 @@ def point_agreement(
         inside = (out_u < INSIDE_MARGIN_M) & (out_v < INSIDE_MARGIN_M)
         to_u = jnp.where(out_v < FACE_OVERHANG_M, jnp.abs(u - face_u), FAR_M)
         to_v = jnp.where(out_u < FACE_OVERHANG_M, jnp.abs(v - face_v), FAR_M)
-        near = NEAR_M / jnp.maximum(jnp.minimum(to_u, to_v), NEAR_M)
+        near = NEAR_M / fast_max(fast_min(to_u, to_v), NEAR_M)
         return total + inside_weight * inside + near_weight * near
 
     # Points that are absent are far from all boxes.

@@ -26,6 +26,10 @@ FAR_FILL_PRIOR = 0.015
 GOLDEN_RATIO_BITS = 0x9E3779B9
 """2^32 over the golden ratio: its multiples fill the 32 bits evenly."""
 
+MINIMA_TABLES = 4
+"""Tables of the lowest points, which the points take turns with: neighbours lie in one cell, and a processor
+waits for what it has just written."""
+
 POOL_CELLS = 2
 """The ground is smoothed on squares of so many cells: twice a cell is still no wider than the Gaussian."""
 
@@ -58,8 +62,10 @@ def cell_minima(
     inside = mask & (jnp.abs(xyz[:, 0]) < half_x_m) & (jnp.abs(xyz[:, 1]) < half_y_m)
     i = jnp.floor((xyz[:, 0] + half_x_m) / GROUND_CANDIDATE_CELL_M).astype(jnp.int32)
     j = jnp.floor((xyz[:, 1] + half_y_m) / GROUND_CANDIDATE_CELL_M).astype(jnp.int32)
-    cell = jnp.where(inside, i * columns + j, rows * columns)
-    lowest = jnp.full(rows * columns, jnp.inf).at[cell].min(xyz[:, 2], mode="drop")
+    table = jnp.arange(xyz.shape[0]) % MINIMA_TABLES * (rows * columns)
+    cell = jnp.where(inside, table + i * columns + j, MINIMA_TABLES * rows * columns)
+    lowest = jnp.full(MINIMA_TABLES * rows * columns, jnp.inf).at[cell].min(xyz[:, 2], mode="drop")
+    lowest = jnp.min(lowest.reshape(MINIMA_TABLES, -1), axis=0)
     occupied = jnp.isfinite(lowest)
     index = jnp.arange(rows * columns)
     x = (index // columns + 0.5) * GROUND_CANDIDATE_CELL_M - half_x_m

@@ -7,10 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import WORD_BITS, prefix_sum, rows_in_use, store
-
-SORT_STEPS = 4
-"""Sorts are as long as what is there, in so many steps."""
+from jaxbox.masked import WORD_BITS, prefix_sum, store
 
 
 def largest_first(size: jax.Array, max_size: int) -> tuple[jax.Array, jax.Array]:
@@ -28,37 +25,9 @@ def largest_first(size: jax.Array, max_size: int) -> tuple[jax.Array, jax.Array]
     >>> order.tolist(), place.tolist()
     ([1, 0, 2], [1, 0, 2])
     """
-    order, _ = group_by(max_size - size, max_size + 1)
+    num = jnp.int32(size.shape[0])
+    order, *_ = sort_by_group(lambda i: i, max_size - size, num, max_size + 1)
     return order, jnp.zeros_like(order).at[order].set(jnp.arange(order.shape[0], dtype=order.dtype))
-
-
-def group_by(group: jax.Array, num_groups: int) -> tuple[jax.Array, jax.Array]:
-    """Orders rows by group, keeping their order within one.
-
-    Args:
-      group: (N,) int32, in [0, num_groups], the latter for rows of no group, which come last.
-      num_groups: static, K.
-
-    Returns:
-      order: (N,) int32 row indices.
-      start: (K + 1,) int32: group k is order[start[k]:start[k + 1]].
-
-    >>> order, start = group_by(jnp.array([1, 0, 2, 1]), 2)
-    >>> order.tolist(), start.tolist()
-    ([1, 0, 3, 2], [0, 1, 3])
-    """
-    size = group.shape[0]
-    index_bits, group_bits = size.bit_length(), num_groups.bit_length()
-    index = jnp.arange(size, dtype=jnp.uint32)
-    if index_bits + group_bits <= WORD_BITS:
-        # One packed word sorts several times faster than a key with its value.
-        packed = _sort_present((group.astype(jnp.uint32) << index_bits) | index, group < num_groups)
-        order = packed & (2**index_bits - 1)
-    else:
-        order = jax.lax.sort((group, index), num_keys=1, is_stable=True)[1]
-    count = jnp.zeros(num_groups, jnp.int32).at[group].add(1, mode="drop")
-    end = prefix_sum(count)
-    return order.astype(jnp.int32), jnp.concatenate([jnp.zeros(1, jnp.int32), end])
 
 
 def sort_by_group(
@@ -118,19 +87,17 @@ def _place_one_by_one(
 def _place_sorted(
     read: Callable[[jax.Array], Any], group: jax.Array, num_rows: jax.Array, begin: jax.Array, *, room: int
 ) -> Any:
-    order, _ = group_by(group, begin.shape[0])
+    order = _stable_order(group, begin.shape[0])
     return jax.tree.map(lambda v: jnp.pad(v, (0, room)), read(order))
 
 
-def _sort_present(words: jax.Array, present: jax.Array) -> jax.Array:
-    """Sorts words of which the absent ones are largest and in order: those past the last present one stay."""
-    size = words.shape[0]
-    step = -(-size // SORT_STEPS)
-    num = rows_in_use(present)
-
-    def sort_first(count: int, words: jax.Array) -> jax.Array:
-        return jnp.concatenate([jax.lax.sort(words[:count], is_stable=False), words[count:]])
-
-    counts = [min(step * (i + 1), size) for i in range(SORT_STEPS)]
-    branches = [functools.partial(sort_first, count) for count in counts]
-    return jax.lax.switch(jnp.maximum(num - 1, 0) // max(step, 1), branches, words)
+def _stable_order(group: jax.Array, num_groups: int) -> jax.Array:
+    """(N,) int32 rows by group, in [0, num_groups], keeping their order within one."""
+    size = group.shape[0]
+    index_bits, group_bits = size.bit_length(), num_groups.bit_length()
+    index = jnp.arange(size, dtype=jnp.uint32)
+    if index_bits + group_bits > WORD_BITS:
+        return jax.lax.sort((group, index), num_keys=1, is_stable=True)[1].astype(jnp.int32)
+    # One packed word sorts several times faster than a key with its value.
+    packed = jax.lax.sort((group.astype(jnp.uint32) << index_bits) | index, is_stable=False)
+    return (packed & (2**index_bits - 1)).astype(jnp.int32)

@@ -11,7 +11,6 @@ SIZES = (1, 2, masked.BLOCK - 1, masked.BLOCK, masked.BLOCK + 1, 3 * masked.BLOC
 
 # Compiled whole: run step by step, each step of each size would compile alone.
 compact = jax.jit(masked.compact, static_argnums=1)
-group_by = jax.jit(grouping.group_by, static_argnums=1)
 
 
 @pytest.mark.usefixtures("platform")
@@ -149,54 +148,38 @@ def test_map_rows_maps_along_the_last_axis_too(backend):
     np.testing.assert_array_equal(mapped, jnp.where(done, 2 * values, 0))
 
 
-def grouped(group, num_groups):
-    order, start = group_by(np.asarray(group, np.int32), num_groups)
-    return np.asarray(order), np.asarray(start)
-
-
 # 12 + 21 bits and 20 + 13 bits do not fit one word: those sort a key with its value.
-@pytest.mark.parametrize(
-    ("size", "num_groups"),
-    [(1, 1), (2, 1), (100, 7), (3000, 3000), (4095, 2**20 - 1), (4096, 2**20), (2**19, 2**12)],
-)
-def test_group_by_is_a_stable_sort_with_the_rows_of_no_group_last(size, num_groups):
-    rng = np.random.default_rng(size)
-    group = rng.integers(0, min(num_groups, 40) + 1, size) * (num_groups // min(num_groups, 40))
-    group = np.minimum(group, num_groups)
-    order, start = grouped(group, num_groups)
-    np.testing.assert_array_equal(order, np.argsort(group, kind="stable"))
-    np.testing.assert_array_equal(start, np.searchsorted(np.sort(group), np.arange(num_groups + 1)))
-
-
-def test_both_sorts_of_group_by_are_tried_above():
-    def packed(size, num_groups):
-        return size.bit_length() + num_groups.bit_length() <= masked.WORD_BITS
-
-    assert packed(4095, 2**20 - 1)
-    assert not packed(4096, 2**20)
-    assert not packed(2**19, 2**12)
+SORTS = [(1, 1), (2, 1), (1000, 40), (3000, 3000), (4095, 2**20 - 1), (4096, 2**20), (2**19, 2**12)]
 
 
 @pytest.mark.usefixtures("platform")
-@pytest.mark.parametrize("num_rows", [0, 1, 700, 1000])
-def test_sort_by_group_is_a_stable_sort_of_the_first_rows_on_every_platform(num_rows):
-    group = np.random.default_rng(num_rows).integers(0, 40, 1000)
-    (rows, minus), begin, end = grouping.sort_by_group(
-        lambda i: (i, -i), jnp.asarray(group), jnp.int32(num_rows), 40, room=3
-    )
-    assert rows.shape == minus.shape == (1003,)
-    np.testing.assert_array_equal(rows[:num_rows], np.argsort(group[:num_rows], kind="stable"))
-    np.testing.assert_array_equal(minus[:num_rows], -rows[:num_rows])
-    count = np.bincount(group[:num_rows], minlength=40)
-    np.testing.assert_array_equal(end, np.cumsum(count))
-    np.testing.assert_array_equal(end - begin, count)
+@pytest.mark.parametrize(("size", "num_groups"), SORTS)
+def test_sort_by_group_is_a_stable_sort_of_the_first_rows_on_every_platform(size, num_groups):
+    num_used = min(num_groups, 40)
+    group = np.random.default_rng(size).integers(0, num_used, size, np.int32) * (num_groups // num_used)
+    sort = jax.jit(lambda n: grouping.sort_by_group(lambda i: (i, -i), group, n, num_groups, room=3))
+    for num_rows in (0, 1, size * 7 // 10, size):
+        (rows, minus), begin, end = sort(jnp.int32(num_rows))
+        assert rows.shape == minus.shape == (size + 3,)
+        np.testing.assert_array_equal(rows[:num_rows], np.argsort(group[:num_rows], kind="stable"))
+        np.testing.assert_array_equal(minus[:num_rows], -rows[:num_rows])
+        count = np.bincount(group[:num_rows], minlength=num_groups)
+        np.testing.assert_array_equal(end, np.cumsum(count))
+        np.testing.assert_array_equal(end - begin, count)
 
 
-@pytest.mark.parametrize("all_in", [0, 5])
-def test_group_by_of_one_group_or_none_keeps_the_order(all_in):
-    order, start = grouped(np.full(9, all_in), 5)
-    assert order.tolist() == list(range(9))
-    assert start.tolist() == ([0, 9, 9, 9, 9, 9] if all_in == 0 else [0] * 6)
+def test_both_sorts_of_sort_by_group_are_tried_above():
+    packed = [size.bit_length() + num_groups.bit_length() <= masked.WORD_BITS for size, num_groups in SORTS]
+    assert packed == [True] * 5 + [False] * 2
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("max_size", [1, 9, 128])
+def test_largest_first_is_a_stable_sort_by_descending_size_on_every_platform(max_size):
+    size = np.random.default_rng(max_size).integers(0, max_size + 1, 700, np.int32)
+    order, place = grouping.largest_first(jnp.asarray(size), max_size)
+    np.testing.assert_array_equal(order, np.argsort(-size, kind="stable"))
+    np.testing.assert_array_equal(order[place], np.arange(700))
 
 
 def test_fold_points_sees_each_point_of_each_cluster_once_and_in_order(backend):
@@ -233,8 +216,8 @@ def test_the_toolbox_gives_the_same_under_jit_and_vmap():
 
     def both(mask):
         index, count = masked.compact(mask, 64)
-        order, start = grouping.group_by(jnp.where(mask, 1, 2), 2)
-        return index, count, order, start
+        order, begin, end = grouping.sort_by_group(lambda i: i, jnp.where(mask, 0, 1), jnp.int32(700), 2)
+        return index, count, order, begin, end
 
     singles = [both(mask) for mask in masks]
     for batch in (jax.vmap(both)(masks), jax.jit(jax.vmap(both))(masks)):

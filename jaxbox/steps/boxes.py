@@ -26,8 +26,12 @@ PROPOSAL_CHUNK = 256
 NUM_BANDS = 4
 """So many bands of cluster sizes put proposals in order, for chunks of like sizes."""
 
-VOTER_CHUNK = 64
-"""Boxes that may vote for the scene's direction at a time: there are few."""
+RAY_CHUNK = 128
+"""Boxes that rays are cast over at a time."""
+
+VOTER_CHUNK = RAY_CHUNK // completion.NUM_WAYS
+"""Rectangles that may vote for the scene's direction at a time: there are few. Each may lie both ways, and
+what comes in one shape XLA compiles once."""
 
 HULL_CHUNK = 32
 """Clusters whose hulls are traced at a time."""
@@ -327,4 +331,4 @@ def cast_rays(
 ) -> evidence.RayFractions:
     """What the rays over each box met, finely enough for its score."""
     cast = functools.partial(_cast, num_rays=config.completion.num_final_rays, seen=seen, config=config)
-    return map_rows(cast, boxes, num_rows=num, chunk=PROPOSAL_CHUNK)
+    return map_rows(cast, boxes, num_rows=num, chunk=RAY_CHUNK)

@@ -35,5 +35,8 @@ def check_settings(config: DetectorConfig) -> None:
 
 
 def class_values(config: DetectorConfig, field: str, label: jax.Array) -> jax.Array:
-    """A field of the class priors, for each label."""
-    return jnp.stack([jnp.asarray(getattr(c, field), jnp.float32) for c in config.vehicles.classes])[label]
+    """A field of the class priors, for each label. Chosen, not looked up: that takes no kernel of its own."""
+    value, *others = (jnp.asarray(getattr(c, field), jnp.float32) for c in config.vehicles.classes)
+    for i, other in enumerate(others, start=1):
+        value = jnp.where(label == i, other, value)
+    return jnp.broadcast_to(value, label.shape)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxbox import clustering, selection
 from jaxbox.class_priors import ClassPrior
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import apart, compact, lookup, take
+from jaxbox.masked import apart, compact, lookup, store, take
 from jaxbox.steps.common import stage_options
 from jaxbox.steps.points import Obstacles
 from jaxbox.types import Clusters, Label, Rectangles
@@ -147,7 +147,9 @@ def _find_components(obstacles: Obstacles, cell: jax.Array, components: clusteri
 
     def step(start: jax.Array, table: jax.Array) -> jax.Array:
         for i in range(len(cell)):
-            table = _store(table, i, start, components.at(_on_map(cell, i, start)))
+            # Look-ups do not vectorise within the write of a chunk (XLA, CPU).
+            component = store(components.at(_on_map(cell, i, start)), obstacles.count >= 0)
+            table = _store(table, i, start, component)
         return table
 
     return _fold_chunks(step, jnp.zeros_like(cell), obstacles)
