@@ -62,7 +62,7 @@ class PointLists:
         j = jnp.arange(self.max_points)[:, None]
         spread = j * (total // self.max_points) + j * (total % self.max_points) // self.max_points
         # Stored, since what a look-up has to work out first does not vectorise.
-        row = store(start + jnp.where(total > self.max_points, spread, j), total[0] >= 0)
+        row = store(start + jnp.where(total > self.max_points, spread, j))
         x, y = (jnp.take(values, row, mode="clip") for values in (self.x, self.y))
         return x, y, jnp.minimum(total, self.max_points)
 

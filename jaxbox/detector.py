@@ -110,7 +110,7 @@ def _find_vehicles(cloud: PointCloud, config: _Settings, key: jax.Array) -> Dete
     # and its scratch memory is freed: beyond 32 MB, glibc would return it to the system at each call, and
     # a sixth of the time would go into getting it back page by page.
     def run(step: Callable[..., Any], *inputs: Any) -> Any:
-        return apart(_with_settings(step), *inputs, proof=cloud.num_points >= 0)
+        return apart(_with_settings(step), *inputs)
 
     # 3.1 Statistical filtering, and ground removal by RANSAC (Algorithm I).
     sweep = run(steps.select_points, cloud, config)
@@ -147,8 +147,7 @@ def _find_many(_size: int, batched: Any, *operands: Any) -> tuple[Detections, An
     On a CPU batched scatters, and loops that end with the largest sweep of the batch, cost more than they
     save. Each step stands behind a wall, see `apart`, so that the compiler makes the same code of it in the
     loop and without, and the batch has the singles' bits. The kernels of one sweep do not fill an
-    accelerator, and to launch them takes longer than to run them; there is no wall between the steps of such
-    a batch, whose conditionals do all of their branches.
+    accelerator, and to launch them takes longer than to run them.
     """
     axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
     in_turn = jax.vmap(_one_after_the_other, axes)

@@ -5,19 +5,24 @@ import os
 import jax
 
 
-def at_a_time(on_cpu: int, on_accelerator: int) -> int:
+def on_accelerator() -> bool:
+    """Whether JAX's default backend is no CPU."""
+    return jax.default_backend() != "cpu"
+
+
+def at_a_time(on_cpu: int, with_accelerator: int) -> int:
     """How many rows a step of a loop takes: on a CPU what its cache holds, on an accelerator many more.
 
-    To launch a kernel takes an accelerator longer than to run so small a one. JAX's default backend decides.
+    To launch a kernel takes an accelerator longer than to run so small a one.
 
     Args:
       on_cpu: rows.
-      on_accelerator: rows.
+      with_accelerator: rows.
 
     Returns:
       One of the two.
     """
-    return on_cpu if jax.default_backend() == "cpu" else on_accelerator
+    return with_accelerator if on_accelerator() else on_cpu
 
 
 def batch_together() -> bool:
@@ -30,4 +35,4 @@ def batch_together() -> bool:
     Returns:
       True where it does.
     """
-    return jax.default_backend() != "cpu" and "deterministic_ops" not in os.environ.get("XLA_FLAGS", "")
+    return on_accelerator() and "deterministic_ops" not in os.environ.get("XLA_FLAGS", "")

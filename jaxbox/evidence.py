@@ -131,8 +131,8 @@ def build_evidence(
     """
     rho = jnp.sqrt(xyz[:, 0] ** 2 + xyz[:, 1] ** 2)
     seen = mask & (rho >= min_range_m)
-    # Stored, or each scatter would work it out again. The proof holds of what is not a number, too.
-    azimuth = store(azimuth_cell(_arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths), ~(rho[0] < 0))
+    # Stored, or each scatter would work it out again.
+    azimuth = store(azimuth_cell(_arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths))
     num_blocks = num_ranges // BLOCK + 1
     size = num_blocks * BLOCK * num_azimuths
 
@@ -305,12 +305,11 @@ def cast_rays(
     Reference: oracle `jaxbox.reference.box_evidence`.
     """
     shape = center.shape[:-1]
-    proof = evidence.support[0, 0] >= 0
     length, width, yaw = (jnp.broadcast_to(a, shape).reshape(-1) for a in (length, width, yaw))
     # Stored, or what is the same for all rays of a box would be worked out for each.
-    fan = store(_ray_fan(center.reshape(-1, 2), length / 2, width / 2, yaw), proof)
-    azimuth, enter, leave = store(_ray_stretches(fan, num_rays), proof)
-    met = store(_sort_rays(evidence, azimuth, enter, leave, range_cell_m, proof), proof)
+    fan = store(_ray_fan(center.reshape(-1, 2), length / 2, width / 2, yaw))
+    azimuth, enter, leave = store(_ray_stretches(fan, num_rays))
+    met = store(_sort_rays(evidence, azimuth, enter, leave, range_cell_m))
     # Sums of integers take several kernels, those of floats one (XLA, CPU), and these are exact.
     sums = (jnp.sum(a, axis=0, dtype=jnp.float32).reshape(shape) for a in met)
     hit, free, deep, crosses, free_cells, cells = sums
@@ -384,7 +383,6 @@ def _sort_rays(
     enter: jax.Array,
     leave: jax.Array,
     range_cell_m: float,
-    proof: jax.Array,
 ) -> tuple[jax.Array, ...]:
     """Whether each ray hit, was free, was deep, crossed at all; its free cells inside, and all there."""
     num_azimuths = evidence.free.shape[1]
@@ -399,12 +397,12 @@ def _sort_rays(
     last = jnp.maximum(cell(leave - FREE_BEFORE_M, 0), first)
     column = azimuth_cell(azimuth, num_azimuths)
     # Stored, since what a look-up has to work out first does not vectorise.
-    ends = store((near, first, last), proof)
+    ends = store((near, first, last))
     near_word, first_word, last_word = (
         lookup(table.reshape(-1), place)
         for table, place in zip(
             (evidence.hit, evidence.free, evidence.free),
-            store([(end >> BLOCK_BITS) * num_azimuths + column for end in ends], proof),
+            store([(end >> BLOCK_BITS) * num_azimuths + column for end in ends]),
             strict=True,
         )
     )

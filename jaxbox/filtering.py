@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import apart, compact, masked_mean, masked_std
+from jaxbox.masked import compact, masked_mean, masked_std, store
 
 MIN_DENSITY = 1e-6
 """Windows with less weight are empty; the smallest of one point in a corner is exp(-1.5) or so."""
@@ -68,7 +68,7 @@ def filter_outliers(
         return ((x * stride + z + margin) * width + y + 1).astype(jnp.uint32)
 
     valid = xyz1[:, 3] > 0
-    cells = apart(cell_of, xyz1, proof=xyz1[0, 3] >= 0)
+    cells = store(cell_of(xyz1))
     # One scatter for the sums and the counts: a point is what is added.
     num_cells = (num_x * stride + 2 * margin) * width
     sums = jnp.zeros((num_cells, 4)).at[cells].add(xyz1, mode="promise_in_bounds")

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.capacities import GROUND_CANDIDATE_CELL_M
-from jaxbox.masked import apart, compact, lookup
+from jaxbox.masked import compact, lookup, store
 from jaxbox.types import GroundPlane
 
 HYPOTHESES_AT_A_TIME = 32
@@ -89,7 +89,7 @@ def spread_points(
       candidates: (C, 3) float32, m.
       chosen: (C,) bool: those that count.
     """
-    # Quotient and remainder apart, so that the product stays within int32.
+    # Quotient and remainder so that the product stays within int32.
     rows = jnp.minimum(num_points, xyz.shape[0])
     j = jnp.arange(num_candidates)
     index = j * (rows // num_candidates) + j * (rows % num_candidates) // num_candidates
@@ -339,8 +339,8 @@ def _lower_envelope(lowest: jax.Array, step_m: jax.Array | float, num_rounds: in
     # The margin wears off jump by jump. No way between two cells is shorter for leading through it.
     envelope = jnp.pad(lowest, num_rounds, constant_values=jnp.inf)
     for jump in _jumps(num_rounds):
-        # Apart, or the compiler works out each cell nine times for the next jump.
-        envelope = apart(functools.partial(spread, jump), envelope, proof=lowest[0, 0] > -jnp.inf)
+        # Stored, or the compiler works out each cell nine times for the next jump.
+        envelope = store(spread(jump, envelope))
     return envelope
 
 

@@ -131,9 +131,8 @@ def convex_hulls(
     Reference: paper, section 3.3 and equation 6; oracle cv2.convexHull.
     """
     size = valid.shape[1]
-    # Whatever absent points hold, the proof below does not see it.
-    x, y = jnp.where(valid, x, jnp.nan), jnp.where(valid, y, 0)
-    chain_x, chain_y, count = _lower_hulls(*store([_both_ways(x), _both_ways(y)], y[0, 0] < jnp.inf))
+    x = jnp.where(valid, x, jnp.nan)
+    chain_x, chain_y, count = _lower_hulls(*store([_both_ways(x), _both_ways(y)]))
     # A chain that ends where the other begins leaves that point to it.
     end = jnp.maximum(count - 1, 0), jnp.arange(2 * size)
     closes_x, closes_y = (chain[end] == -jnp.roll(chain[0], size) for chain in (chain_x, chain_y))
@@ -146,8 +145,8 @@ def convex_hulls(
     is_lower = pick < num_lower
     place = jnp.where(is_lower, pick, pick - num_lower), jnp.arange(size) + jnp.where(is_lower, 0, size)
     # Stored: a look-up vectorises neither with what finds its place, nor within the write of a chunk (XLA).
-    place = store(place, num[0] >= 0)
-    x, y = store([lookup(chain, *place) for chain in (chain_x, chain_y)], num[0] >= 0)
+    place = store(place)
+    x, y = store([lookup(chain, *place) for chain in (chain_x, chain_y)])
     return jnp.where(is_lower, x, -x), jnp.where(is_lower, y, -y), num
 
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox.devices import at_a_time
+from jaxbox.devices import at_a_time, on_accelerator
 
 BLOCK = 512
 """Columns of sums in two levels; a sum of so many flags fits the bits that `count_true` gives it."""
@@ -236,22 +236,31 @@ def lookup(table: jax.Array, *index: jax.Array) -> jax.Array:
     return jnp.take(table.reshape(-1), flat, mode="clip")
 
 
-def store(values: Any, proof: jax.Array) -> Any:
+def store(values: Any) -> Any:
     """Has values computed once and stored, where the compiler would compute them in every reader.
 
-    XLA fuses a producer into each of its consumers; a conditional is a wall that fusion does not cross.
+    XLA fuses a producer into each of its consumers. A loop is a wall that fusion does not cross, even one of
+    no turn: barriers keep the compiler from seeing that it has none, and that a turn would change nothing.
+    (A conditional would copy what goes through it.) There are no walls on an accelerator, whose host would
+    wait at each.
 
     Args:
       values: pytree of arrays.
-      proof: () bool, True whenever the values are wanted; the compiler must not know that it is.
 
     Returns:
-      The values, or zeros where `proof` is False.
+      The values.
     """
-    return jax.lax.cond(proof, lambda v: v, lambda v: jax.tree.map(jnp.zeros_like, v), values)
+    if on_accelerator():
+        return values
+    never = jax.lax.optimization_barrier(jnp.bool_(False))
+
+    def turn(state: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        return jax.lax.optimization_barrier(state)
+
+    return jax.lax.while_loop(lambda state: state[0], turn, (never, values))[1]
 
 
-def apart(function: Callable[..., Any], *operands: Any, proof: jax.Array) -> Any:
+def apart(function: Callable[..., Any], *operands: Any) -> Any:
     """Calls a function in a room of its own: its scratch memory lives while it runs, and no longer.
 
     XLA makes constants, such as the zeros that a scatter starts from, as early as it can: those of a long
@@ -261,15 +270,17 @@ def apart(function: Callable[..., Any], *operands: Any, proof: jax.Array) -> Any
     Args:
       function: of the operands.
       *operands: whatever it takes.
-      proof: () bool, True whenever the result is wanted; the compiler must not know that it is.
 
     Returns:
-      The function's result, or zeros where `proof` is False.
+      The function's result.
     """
+    if on_accelerator():
+        return function(*operands)
     traced_once = jax.jit(function, inline=True)
     shapes = jax.eval_shape(traced_once, *operands)
+    always = jax.lax.optimization_barrier(jnp.bool_(True))
     return jax.lax.cond(
-        proof,
+        always,
         lambda: traced_once(*operands),
         lambda: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes),
     )

@@ -160,7 +160,7 @@ def select_clusters(
     extent_x, extent_y = upper[:, 0] + upper[:, 3], upper[:, 1] + upper[:, 4]
     keep = keep & (jnp.maximum(extent_x, extent_y) <= max_extent_m)
     keep = keep & (extent_x**2 + extent_y**2 >= min_extent_m**2)
-    keep, order = store((keep, prefix_sum(keep)), first[0] >= 0)
+    keep, order = store((keep, prefix_sum(keep)))
     end = lookup(order, first - 1)
     found = end[1:] - end[:-1]
     kept = jnp.minimum(found, jnp.array(max_clusters))

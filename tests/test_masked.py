@@ -108,6 +108,22 @@ def backend(request, monkeypatch):
     return request.param
 
 
+@pytest.mark.parametrize("wall", ["store", "apart", "none"])
+def test_what_stands_behind_a_wall_is_computed_once_for_all_who_read_it(wall, backend):
+    walls = {"store": lambda x: masked.store(jnp.sin(x)), "apart": lambda x: masked.apart(jnp.sin, x)}
+    sine = walls.get(wall, jnp.sin)
+
+    def read_twice(x):
+        y = sine(x)
+        return jnp.cumsum(y + 1), 2 * y[::-1]
+
+    x = jax.device_put(np.linspace(0, 9, 5000, dtype=np.float32), jax.devices("cpu")[0])
+    program = jax.jit(read_twice).lower(x).compile()
+    has_wall = backend == "cpu" and wall in walls
+    assert program.as_text().count(" sine(") == (1 if has_wall else 2)
+    np.testing.assert_array_equal(program(x)[1], 2 * np.asarray(jnp.sin(x))[::-1])
+
+
 @pytest.mark.parametrize("num_rows", [0, 1, 8, 19, 20])
 def test_fold_rows_sees_each_row_once_and_no_chunk_beyond_those_that_count(num_rows, backend):
     def add(state, index, rows):

@@ -123,7 +123,7 @@ def _owners(
     # No point is inside the box of no detection.
     frame = jnp.pad(frame, ((0, 1), (0, 0)), constant_values=-1)
     best = functools.reduce(jnp.minimum, [lookup(of_cluster, cluster) for cluster in proposals.cluster])
-    asked, num_asked = compact(store(best < num_detections, obstacles.count >= 0), best.shape[0])
+    asked, num_asked = compact(store(best < num_detections), best.shape[0])
 
     def own(index: jax.Array) -> jax.Array:
         xy = take(obstacles.xy, index)
@@ -136,7 +136,7 @@ def _owners(
             inside = inside & (jnp.abs(dy * cos - dx * sin) <= half_width)
             owner = jnp.minimum(owner, jnp.where(inside, detection, num_detections))
         # Look-ups do not vectorise within the write of a chunk (XLA, CPU).
-        return store(owner, obstacles.count >= 0)
+        return store(owner)
 
     return asked, map_rows(own, asked, num_rows=num_asked, chunk=OWNER_CHUNK), num_asked
 

@@ -102,7 +102,7 @@ def trace_hulls(
 
     def trace(index: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         # Stored, or each of the hulls' steps that read them would look them up.
-        x, y = store([jnp.take(xy[:, axis], index, mode="clip") for axis in (0, 1)], num_clusters > 0)
+        x, y = store([jnp.take(xy[:, axis], index, mode="clip") for axis in (0, 1)])
         return hull.convex_hulls(x, y, index < xy.shape[0], max_vertices=config.hull.max_vertices)
 
     return map_rows(trace, index, num_rows=num_clusters, chunk=HULL_CHUNK, axis=-1)
@@ -297,7 +297,7 @@ def _in_order_of_size(
     """
     band = jnp.minimum(num_points * NUM_BANDS // max_points, NUM_BANDS - 1)
     # Stored, or each word of flags would work it out bit by bit.
-    possible, band = store((possible, band), num_points[0] >= 0)
+    possible, band = store((possible, band))
     flags = possible & (band == jnp.arange(NUM_BANDS)[::-1, None, None])
     index, num = compact(flags.reshape(-1), possible.size)
     return jnp.where(index < flags.size, index % possible.size, possible.size), num

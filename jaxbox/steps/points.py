@@ -1,14 +1,13 @@
 """From the sweep to the points above the ground."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 
 from jaxbox import filtering, ground
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import apart, compact, take
+from jaxbox.masked import compact, store, take
 from jaxbox.steps.common import stage_options
 from jaxbox.types import GroundPlane, PointCloud
 
@@ -39,8 +38,7 @@ def select_points(cloud: PointCloud, config: DetectorConfig) -> Sweep:
     """Picks the finite points in the region, and those of them that are no outliers."""
     region = stage_options(config.region)
     limits = (*region.values(), MAX_ABS_Z_M)
-    proof = cloud.num_points >= 0
-    xyz1, present, finite, valid = apart(functools.partial(_in_region, limits), cloud.xyz1, proof=proof)
+    xyz1, present, finite, valid = store(_in_region(limits, cloud.xyz1))
     inlier = valid
     if config.filtering.enabled:
         inlier = filtering.filter_outliers(xyz1, **region, **stage_options(config.filtering, "enabled"))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxbox import clustering, selection
 from jaxbox.class_priors import ClassPrior
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import apart, compact, lookup, store, take
+from jaxbox.masked import compact, lookup, store, take
 from jaxbox.steps.common import stage_options
 from jaxbox.steps.points import Obstacles
 from jaxbox.types import Clusters, Label, Rectangles
@@ -131,7 +131,8 @@ def _find_cells(
     def step(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         table, flags = state
         present = start + jnp.arange(CHUNK) < obstacles.count
-        xy = apart(warp, _chunk(obstacles.xy, start), proof=obstacles.count >= 0)
+        # Stored, or each map would draw the points together anew.
+        xy = store(warp(_chunk(obstacles.xy, start)))
         for i, cell in enumerate(find(xy, _chunk(obstacles.height, start), present)):
             flags = flags.at[cells.flag(cell)].set(1, mode="promise_in_bounds")
             table = _store(table, i, start, cell)
@@ -148,7 +149,7 @@ def _find_components(obstacles: Obstacles, cell: jax.Array, components: clusteri
     def step(start: jax.Array, table: jax.Array) -> jax.Array:
         for i in range(len(cell)):
             # Look-ups do not vectorise within the write of a chunk (XLA, CPU).
-            component = store(components.at(_on_map(cell, i, start)), obstacles.count >= 0)
+            component = store(components.at(_on_map(cell, i, start)))
             table = _store(table, i, start, component)
         return table
 
