@@ -6,7 +6,7 @@ import jax
 
 
 def on_accelerator() -> bool:
-    """Whether JAX's default backend is no CPU."""
+    """Whether JAX's default backend is no CPU: a CPU beside an accelerator has the accelerator's program."""
     return jax.default_backend() != "cpu"
 
 

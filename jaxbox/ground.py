@@ -62,9 +62,11 @@ def cell_minima(
     inside = mask & (jnp.abs(xyz[:, 0]) < half_x_m) & (jnp.abs(xyz[:, 1]) < half_y_m)
     i = jnp.floor((xyz[:, 0] + half_x_m) / GROUND_CANDIDATE_CELL_M).astype(jnp.int32)
     j = jnp.floor((xyz[:, 1] + half_y_m) / GROUND_CANDIDATE_CELL_M).astype(jnp.int32)
-    table = jnp.arange(xyz.shape[0]) % MINIMA_TABLES * (rows * columns)
-    cell = jnp.where(inside, table + i * columns + j, MINIMA_TABLES * rows * columns)
-    lowest = jnp.full(MINIMA_TABLES * rows * columns, jnp.inf).at[cell].min(xyz[:, 2], mode="drop")
+    cell, num_cells = i * columns + j, rows * columns
+    table = jnp.arange(xyz.shape[0]) % MINIMA_TABLES
+    # What rounding puts past the last cell would be another table's.
+    place = jnp.where(inside & (cell < num_cells), table * num_cells + cell, MINIMA_TABLES * num_cells)
+    lowest = jnp.full(MINIMA_TABLES * num_cells, jnp.inf).at[place].min(xyz[:, 2], mode="drop")
     lowest = jnp.min(lowest.reshape(MINIMA_TABLES, -1), axis=0)
     occupied = jnp.isfinite(lowest)
     index = jnp.arange(rows * columns)
@@ -89,7 +91,7 @@ def spread_points(
       candidates: (C, 3) float32, m.
       chosen: (C,) bool: those that count.
     """
-    # Quotient and remainder so that the product stays within int32.
+    # Quotient and remainder apart, so that the product stays within int32.
     rows = jnp.minimum(num_points, xyz.shape[0])
     j = jnp.arange(num_candidates)
     index = j * (rows // num_candidates) + j * (rows % num_candidates) // num_candidates

@@ -265,7 +265,7 @@ def apart(function: Callable[..., Any], *operands: Any) -> Any:
 
     XLA makes constants, such as the zeros that a scatter starts from, as early as it can: those of a long
     program would all be there from its start, beside the scratch of whatever comes first. What is inside a
-    conditional is made when it is needed, and computed once, see `store`.
+    conditional is made when it is needed, and stored. On an accelerator the function is simply called.
 
     Args:
       function: of the operands.

@@ -58,6 +58,12 @@ def cases(request: pytest.FixtureRequest) -> tuple[parity.Case, ...]:
 @pytest.fixture(params=["cpu", "default"])
 def platform(request, monkeypatch):
     """Either form of what is done otherwise on a CPU, whatever the tests run on."""
-    branch = request.param
-    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, **branches: branches[branch](*args))
-    return branch
+    taken = []
+
+    def take_branch(*args, **branches):
+        taken.append(request.param)
+        return branches[request.param](*args)
+
+    monkeypatch.setattr(jax.lax, "platform_dependent", take_branch)
+    yield request.param
+    assert taken, "Traced before: jit a function of the test's own."

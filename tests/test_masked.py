@@ -1,5 +1,7 @@
 """Laws of the fixed-shape toolbox, against NumPy at every awkward size."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -164,7 +166,7 @@ def test_map_rows_maps_along_the_last_axis_too(backend):
     np.testing.assert_array_equal(mapped, jnp.where(done, 2 * values, 0))
 
 
-# 12 + 21 bits and 20 + 13 bits do not fit one word: those sort a key with its value.
+# 13 + 21 bits and 20 + 13 bits do not fit one word: those sort a key with its value.
 SORTS = [(1, 1), (2, 1), (1000, 40), (3000, 3000), (4095, 2**20 - 1), (4096, 2**20), (2**19, 2**12)]
 
 
@@ -185,8 +187,12 @@ def test_sort_by_group_is_a_stable_sort_of_the_first_rows_on_every_platform(size
 
 
 def test_both_sorts_of_sort_by_group_are_tried_above():
-    packed = [size.bit_length() + num_groups.bit_length() <= masked.WORD_BITS for size, num_groups in SORTS]
-    assert packed == [True] * 5 + [False] * 2
+    def num_operands(size, num_groups):
+        order = functools.partial(grouping._stable_order, num_groups=num_groups)
+        jaxpr = jax.make_jaxpr(order)(jax.ShapeDtypeStruct((size,), jnp.int32))
+        return [len(eqn.invars) for eqn in jaxpr.eqns if eqn.primitive.name == "sort"]
+
+    assert [num_operands(*sort) for sort in SORTS] == [[1]] * 5 + [[2]] * 2
 
 
 @pytest.mark.usefixtures("platform")
@@ -232,7 +238,7 @@ def test_the_toolbox_gives_the_same_under_jit_and_vmap():
 
     def both(mask):
         index, count = masked.compact(mask, 64)
-        order, begin, end = grouping.sort_by_group(lambda i: i, jnp.where(mask, 0, 1), jnp.int32(700), 2)
+        order, begin, end = grouping.sort_by_group(lambda i: i, jnp.where(mask, 0, 1), jnp.sum(mask), 2)
         return index, count, order, begin, end
 
     singles = [both(mask) for mask in masks]

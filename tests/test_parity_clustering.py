@@ -144,7 +144,7 @@ SHAPES = {
 @pytest.mark.parametrize("name", SHAPES)
 def test_components_of_random_grids_are_those_of_scipy_on_every_platform(name):
     # From single cells to one component, past the density at which paths are longest.
-    label = jax.jit(label_cells.__wrapped__, static_argnames=("row", "max_runs"))
+    label = jax.jit(functools.partial(label_cells.__wrapped__), static_argnames=("row", "max_runs"))
     rng = np.random.default_rng(0)
     row = clustering.CellRow(SHAPES[name])
     size = max(np.prod(shape) for shape in SHAPES[name])
@@ -192,7 +192,7 @@ def test_runs_beyond_the_capacity_belong_to_no_component():
 
 @pytest.mark.usefixtures("platform")
 def test_runs_beyond_the_capacity_join_nothing():
-    label = jax.jit(label_cells.__wrapped__, static_argnames=("row", "max_runs"))
+    label = jax.jit(functools.partial(label_cells.__wrapped__), static_argnames=("row", "max_runs"))
     row = clustering.CellRow(((20, 40, 1),))
     # The third touches the first, and nothing the second.
     cells = in_row(np.array([[0, 1, 0], [0, 30, 0], [1, 0, 0]], np.int32), row, 0)[None]

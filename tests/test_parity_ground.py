@@ -114,3 +114,9 @@ def test_heights_are_those_of_the_reference_on_one_plane_and_on_two(cases):
             differ = np.asarray(height)[: len(xyz)] - expected
             # 6e-5 on the border of the grid only: the compiled stage stops a thousandth of a cell short.
             parity.assert_within(differ, 6e-5, f"m of heights over {len(planes)} planes")
+
+
+def test_what_rounding_puts_past_the_last_cell_is_no_minimum_of_another():
+    xyz = np.tile(np.array([[2.1, 0, -9]], np.float32), (8, 1))
+    _, occupied = ground.cell_minima(xyz, np.ones(8, bool), half_x_m=2.2, half_y_m=2.2)
+    assert not occupied.any()
