@@ -329,7 +329,7 @@ class _Runs:
     num: jax.Array  # () int32, at most C
 
     def look(self, row: CellRow, side: int, cell: jax.Array, node: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Whether each node touches a run at the cell on a line beside it (side 0 before, 1 after), and which."""
+        """Whether each node touches a run at the cell beside its line (before, 0, or after, 1), and which."""
         place = _place(cell, row.num_strips)
         other = _run_at(self.starts, self.before, place)
         exist = (node > NONE) & (node < self.num) & (other < self.num)
