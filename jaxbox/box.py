@@ -279,12 +279,8 @@ def best_rectangles(
     best = jnp.min(jnp.where(is_best, angle, num_angles - 1), axis=0).astype(jnp.int32)
     u0, u1, v0, v1 = jnp.take_along_axis(extents, best[None, None], axis=1)[:, 0]
     worth = jnp.take_along_axis(curve, best[None], axis=0)[0]
-    return Rectangles(
-        angle=best * (math.pi / 2 / num_angles),
-        low=jnp.stack([u0, v0], axis=1),
-        high=jnp.stack([u1, v1], axis=1),
-        worth=worth + preference[best],
-    )
+    angle = best * (math.pi / 2 / num_angles)
+    return Rectangles(jnp.stack([u0, v0, u1, v1, angle, worth + preference[best]], axis=1))
 
 
 def scene_preference(

@@ -54,22 +54,25 @@ class Ways:
         return self.along[1] - self.along[0], self.across[1] - self.across[0]
 
 
-def ways_to_lie(rectangle: Rectangles) -> Ways:
-    """The two ways to call one side the length.
+def way_to_lie(rectangle: Rectangles, side: jax.Array) -> Ways:
+    """Takes one side of each rectangle as its length.
 
     Args:
-      rectangle: P rectangles.
+      rectangle: of any shape.
+      side: int32, broadcasts with them: 0 where the length is along u, 1 where it is along v.
 
     Returns:
-      Ways (2, P).
+      Ways of the shape of both.
     """
-    (u0, v0), (u1, v1) = rectangle.low.T, rectangle.high.T
+    (u0, v0), (u1, v1) = (jnp.moveaxis(bounds, -1, 0) for bounds in (rectangle.low, rectangle.high))
+    along_v = side > 0
     # With the length along v the frame turns by a quarter: across it lies -u.
-    ways = (
-        Ways((u0, u1), (v0, v1), rectangle.angle, rectangle.worth),
-        Ways((v0, v1), (-u1, -u0), rectangle.angle + math.pi / 2, rectangle.worth),
+    return Ways(
+        along=(jnp.where(along_v, v0, u0), jnp.where(along_v, v1, u1)),
+        across=(jnp.where(along_v, -u1, v0), jnp.where(along_v, -u0, v1)),
+        yaw=jnp.where(along_v, rectangle.angle + math.pi / 2, rectangle.angle),
+        worth=jnp.broadcast_to(rectangle.worth, jnp.broadcast_shapes(rectangle.worth.shape, side.shape)),
     )
-    return jax.tree.map(lambda *of_way: jnp.stack(of_way), *ways)
 
 
 def fits(ways: Ways, max_length_m: jax.Array, max_width_m: jax.Array) -> jax.Array:
@@ -133,9 +136,8 @@ def _extend(side: tuple[jax.Array, jax.Array], size: jax.Array) -> tuple[jax.Arr
 
 def longer_side(rectangle: Rectangles) -> Ways:
     """Ways (P,) with the longer side as length."""
-    first, second = (jax.tree.map(lambda a, i=i: a[i], ways_to_lie(rectangle)) for i in range(NUM_WAYS))
-    longer = second.measured[0] > first.measured[0]
-    return jax.tree.map(lambda a, b: jnp.where(longer, b, a), first, second)
+    along_u, along_v = jnp.moveaxis(rectangle.high - rectangle.low, -1, 0)
+    return way_to_lie(rectangle, (along_v > along_u).astype(jnp.int32))
 
 
 def keep_measured(ways: Ways, *, max_length_m: jax.Array, max_width_m: jax.Array) -> Boxes:

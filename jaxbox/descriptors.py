@@ -6,9 +6,6 @@ import jax.numpy as jnp
 from jaxbox.masked import fold_rows, take
 from jaxbox.types import Descriptors
 
-POINT_CHUNK = 4096
-"""Points looked at together."""
-
 MIN_VARIANCE = 1e-6
 """m^2: points on a line have a minor axis of a millimetre rather than none."""
 
@@ -30,18 +27,15 @@ def point_moments(
     """
     size = origin.shape[0]
 
-    def add(total: list[jax.Array], _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> list[jax.Array]:
+    def add(total: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
         slot, row = rows
         d = take(xy, row) - take(origin, slot)
-        # A scatter each: one of rows would first have to be built, which costs more (XLA, CPU).
-        values = (jnp.ones_like(d[:, 0]), d, d * d, d[:, 0] * d[:, 1])
-        return [t.at[slot].add(v, mode="drop") for t, v in zip(total, values, strict=True)]
+        x, y = d[:, :1], d[:, 1:]
+        values = jnp.concatenate([jnp.ones_like(x), x, y, x * x, y * y, x * y], axis=1)
+        return total.at[slot].add(values, mode="drop")
 
-    total = [jnp.zeros(size), jnp.zeros((size, 2)), jnp.zeros((size, 2)), jnp.zeros(size)]
-    total = fold_rows(
-        add, total, (slot, row), num_rows=num_rows, chunk=POINT_CHUNK, absent=(size, xy.shape[0])
-    )
-    return jnp.concatenate([t.reshape(size, -1) for t in total], axis=1)
+    absent = size, xy.shape[0]
+    return fold_rows(add, jnp.zeros((size, 6)), (slot, row), num_rows=num_rows, absent=absent)
 
 
 def shape_descriptors(moments: jax.Array, hull_area: jax.Array, num_vertices: jax.Array) -> Descriptors:

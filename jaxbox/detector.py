@@ -12,7 +12,7 @@ import numpy as np
 from jaxbox import steps
 from jaxbox.config import DetectorConfig
 from jaxbox.devices import batch_together
-from jaxbox.masked import apart
+from jaxbox.masked import AT_ONCE, apart, at_once
 from jaxbox.types import Detections, PointCloud
 
 
@@ -101,8 +101,15 @@ class _Settings:
         )
 
     def unpack(self) -> DetectorConfig:
-        values = jax.lax.split(jnp.asarray(self.thresholds), [1] * self.structure.num_leaves)
-        return jax.tree.unflatten(self.structure, [jax.lax.squeeze(value, (0,)) for value in values])
+        values = jnp.asarray(self.thresholds)
+
+        def cut_up(numbers: range) -> list[jax.Array]:
+            return [jax.lax.squeeze(values[i : i + 1], (0,)) for i in numbers]
+
+        every = range(values.size)
+        parts = (every[first : first + AT_ONCE] for first in every[::AT_ONCE])
+        thresholds = [value for part in parts for value in at_once(functools.partial(cut_up, part))]
+        return jax.tree.unflatten(self.structure, thresholds)
 
 
 def _find_vehicles(cloud: PointCloud, config: _Settings, key: jax.Array) -> Detections:

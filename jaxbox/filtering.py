@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import compact, masked_mean, masked_std, store
+from jaxbox.masked import compact, for_chunks, masked_mean, masked_std, store
 
 MIN_DENSITY = 1e-6
 """Windows with less weight are empty; the smallest of one point in a corner is exp(-1.5) or so."""
@@ -107,12 +107,12 @@ def _of_occupied(function: Callable[[jax.Array], jax.Array], sums: jax.Array) ->
     count = blocks @ jnp.tile(jnp.array([0.0, 0, 0, 1]), BLOCK_CELLS)
     occupied, num = compact(count > 0, blocks.shape[0])
 
-    def step(i: jax.Array, ends: jax.Array) -> jax.Array:
-        block = jax.lax.dynamic_slice_in_dim(occupied, i * CHUNK_BLOCKS, min(CHUNK_BLOCKS, blocks.shape[0]))
+    def step(start: jax.Array, ends: jax.Array) -> jax.Array:
+        block = jax.lax.dynamic_slice_in_dim(occupied, start, min(CHUNK_BLOCKS, blocks.shape[0]))
         cell = (block[:, None] * BLOCK_CELLS + jnp.arange(BLOCK_CELLS)).reshape(-1)
         return ends.at[block].set(function(cell).reshape(-1, size), mode="drop")
 
-    return jax.lax.fori_loop(0, (num + CHUNK_BLOCKS - 1) // CHUNK_BLOCKS, step, blocks)
+    return for_chunks(num, CHUNK_BLOCKS, step, blocks)
 
 
 def _window_sums(sums: jax.Array, stride: int, weight: jax.Array) -> jax.Array:

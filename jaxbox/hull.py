@@ -5,9 +5,6 @@ import jax.numpy as jnp
 
 from jaxbox.masked import WORD_BITS, fold_rows, lookup, store, take
 
-POINT_CHUNK = 4096
-"""Points looked at together."""
-
 MIN_EXTENT_M = 1e-6
 """Clusters narrower than this are cut as if they were so wide: all their points are in one slice."""
 
@@ -28,17 +25,16 @@ def find_bounds(
       low: (K, 2) float32, m; infinite where a cluster has no point.
       high: (K, 2) float32, m; likewise, minus infinity.
     """
-    # Low bounds are high ones of the points turned by half a turn.
-    sign = jnp.array([[1.0], [-1.0]])
 
     def widen(bounds: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
         slot, row = rows
-        both = take(xy, row)[:, None] * sign
-        return bounds.at[slot].max(both.reshape(-1, 4), mode="drop")
+        # Low bounds are high ones of the points turned by half a turn.
+        both = jnp.concatenate([take(xy, row), -take(xy, row)], axis=1)
+        return bounds.at[slot].max(both, mode="drop")
 
     none = jnp.full((num_clusters, 4), -jnp.inf)
     absent = num_clusters, xy.shape[0]
-    bounds = fold_rows(widen, none, (slot, row), num_rows=num_rows, chunk=POINT_CHUNK, absent=absent)
+    bounds = fold_rows(widen, none, (slot, row), num_rows=num_rows, absent=absent)
     return -bounds[:, 2:], bounds[:, :2]
 
 
@@ -51,6 +47,7 @@ def extreme_points(
     high: jax.Array,
     *,
     num_slices: int,
+    chunk: int = 1,
 ) -> jax.Array:
     """The points of each cluster that can reach its hull: the extremes of thin slices.
 
@@ -67,6 +64,8 @@ def extreme_points(
       low: (K, 2) float32, m, least x and y of each cluster.
       high: (K, 2) float32, m, greatest x and y.
       num_slices: static, S.
+      chunk: static, points at a time on a CPU: of many points thousands take half as long as one by one,
+        which is less to compile.
 
     Returns:
       (4 S, K) int32: rows of points, some of them twice; N where a slice is empty.
@@ -101,7 +100,7 @@ def extreme_points(
 
     none = [jnp.zeros(num_slices * num_clusters, jnp.uint32)] * 4
     absent = num_clusters, xy.shape[0]
-    best = fold_rows(keep_extremes, none, (slot, row), num_rows=num_rows, chunk=POINT_CHUNK, absent=absent)
+    best = fold_rows(keep_extremes, none, (slot, row), num_rows=num_rows, chunk=chunk, absent=absent)
     best = jnp.concatenate(best).reshape(-1, num_clusters)
     index = (best & (2**index_bits - 1)).astype(jnp.int32)
     return jnp.where(index > 0, take(row, jnp.maximum(index - 1, 0)), xy.shape[0])

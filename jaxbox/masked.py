@@ -15,7 +15,7 @@ import numpy as np
 from jaxbox.devices import at_a_time, on_accelerator
 
 BLOCK = 512
-"""Columns of sums in two levels; a sum of so many flags fits the bits that `count_true` gives it."""
+"""Columns of sums in two levels."""
 
 PREFIX_UNROLL = 4
 """Numbers taken in one step of the loop of a prefix sum: twice as fast as one."""
@@ -34,6 +34,9 @@ _PLACES_OF_BYTE = np.array(
     np.uint8,
 )
 """(256, 8): where the set bits of each byte are, lowest first; 0 beyond."""
+
+AT_ONCE = 62
+"""Numbers that `at_once` may copy: what reads and writes more than a kilobyte is no small loop to XLA."""
 
 FOLD_UNROLL = 4, 16
 """Points folded in one step of the loop over them, on a CPU and on an accelerator."""
@@ -236,6 +239,22 @@ def lookup(table: jax.Array, *index: jax.Array) -> jax.Array:
     return jnp.take(table.reshape(-1), flat, mode="clip")
 
 
+def split_index(index: jax.Array, size: int) -> tuple[jax.Array, jax.Array]:
+    """Row and column of flat indices into a table of rows of a size.
+
+    Args:
+      index: int32, not negative: `//` and `%` of numbers that may be take several times as much code.
+      size: static.
+
+    Returns:
+      The quotients and the remainders.
+
+    >>> [part.tolist() for part in split_index(jnp.array([1, 7]), 3)]
+    [[0, 2], [1, 1]]
+    """
+    return jax.lax.div(index, jnp.int32(size)), jax.lax.rem(index, jnp.int32(size))
+
+
 def store(values: Any) -> Any:
     """Has values computed once and stored, where the compiler would compute them in every reader.
 
@@ -286,29 +305,81 @@ def apart(function: Callable[..., Any], *operands: Any) -> Any:
     )
 
 
-def count_true(*masks: jax.Array) -> list[jax.Array]:
-    """How many entries of each mask are True.
+def at_once(function: Callable[..., Any], *operands: Any) -> Any:
+    """Computes a few dozen numbers in one kernel, where each would have its own.
 
-    One pass for every three masks: a sum of words counts them all, each in bits of its own.
+    XLA compiles so small a loop, here of one turn, to native code on the CPU, see `AT_ONCE`. On an
+    accelerator the function is simply called.
 
     Args:
-      *masks: (N,) bool each.
+      function: of the operands.
+      *operands: whatever it takes.
 
     Returns:
-      () int32 each.
-
-    >>> [int(n) for n in count_true(jnp.array([True, False]), jnp.array([True, True]))]
-    [1, 2]
+      The function's result.
     """
-    bits = BLOCK.bit_length()
+    if on_accelerator():
+        return function(*operands)
+    once = jax.lax.optimization_barrier(jnp.bool_(True))
+    shapes = jax.eval_shape(function, *operands)
+    nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    turn = jax.lax.while_loop(
+        lambda state: state[0], lambda _: (jnp.bool_(False), function(*operands)), (once, nothing)
+    )
+    return turn[1]
+
+
+def for_chunks(num_rows: jax.Array, chunk: int, step: Callable[[jax.Array, Any], Any], state: Any) -> Any:
+    """Calls a step with each chunk of the rows that count, one after the other.
+
+    The loop counts rows and not chunks, and without a sign: to divide, to multiply, and to look whether an
+    index counts from the end would be a kernel each (XLA, CPU).
+
+    Args:
+      num_rows: () int32, how many rows count.
+      chunk: static, rows at a time.
+      step: maps the first row () uint32 of a chunk, and the state, to the next state.
+      state: pytree of arrays.
+
+    Returns:
+      The state after the last chunk.
+    """
+    end = num_rows.astype(jnp.uint32)
+
+    def turn(loop: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        start, state = loop
+        return start + chunk, step(start, state)
+
+    return jax.lax.while_loop(lambda loop: loop[0] < end, turn, (jnp.uint32(0), state))[1]
+
+
+def count_true(*masks: jax.Array) -> jax.Array:
+    """How many entries of each mask are True.
+
+    A sum of words counts five masks, each in bits of its own. The sums of those are of floats, since XLA
+    makes a tree of kernels of each long sum of integers.
+
+    Args:
+      *masks: (N,) bool each, of any sizes up to 2^24.
+
+    Returns:
+      (number of masks,) int32.
+
+    >>> count_true(jnp.array([True, False]), jnp.array([True, True, True])).tolist()
+    [1, 3]
+    """
+    bits = WORD_BITS.bit_length()
     per_word = WORD_BITS // bits
-    totals = []
-    for first in range(0, len(masks), per_word):
-        group = masks[first : first + per_word]
-        word = functools.reduce(jnp.add, [jnp.where(mask, 1 << k * bits, 0) for k, mask in enumerate(group)])
-        words = jnp.sum(jnp.pad(word, (0, -word.shape[0] % BLOCK)).reshape(-1, BLOCK), axis=1)
-        totals += [jnp.sum((words >> k * bits) & (2**bits - 1)) for k in range(len(group))]
-    return totals
+    size = max(mask.shape[0] for mask in masks)
+    size += -size % WORD_BITS
+    of_mask = [
+        jnp.where(jnp.pad(mask, (0, size - mask.shape[0])), 1 << k % per_word * bits, 0)
+        for k, mask in enumerate(masks)
+    ]
+    words = [functools.reduce(jnp.add, of_mask[k : k + per_word]) for k in range(0, len(masks), per_word)]
+    sums = jnp.stack([jnp.sum(word.reshape(-1, WORD_BITS), axis=1) for word in words])
+    counts = (sums[:, None] >> jnp.arange(per_word)[:, None] * bits) & (2**bits - 1)
+    return jnp.sum(counts.astype(jnp.float32), axis=-1).astype(jnp.int32).reshape(-1)[: len(masks)]
 
 
 def masked_mean(values: jax.Array, mask: jax.Array) -> jax.Array:
@@ -372,21 +443,20 @@ def map_rows(
 
     padded = jax.tree.map(extended, rows)
 
-    def part(i: jax.Array) -> Any:
-        return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, i * chunk, chunk, axis), padded)
+    def part(start: jax.Array) -> Any:
+        return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, start, chunk, axis), padded)
 
-    def step(i: jax.Array, out: Any) -> Any:
-        new = function(part(i))
-        return jax.tree.map(lambda o, n: jax.lax.dynamic_update_slice_in_dim(o, n, i * chunk, axis), out, new)
+    def step(start: jax.Array, out: Any) -> Any:
+        new = function(part(start))
+        return jax.tree.map(lambda o, n: jax.lax.dynamic_update_slice_in_dim(o, n, start, axis), out, new)
 
     def empty(shape: jax.ShapeDtypeStruct) -> jax.Array:
         size = list(shape.shape)
         size[axis] = capacity + missing
         return jnp.zeros(size, shape.dtype)
 
-    out = jax.tree.map(empty, jax.eval_shape(function, jax.eval_shape(part, 0)))
-    num_chunks = (jnp.minimum(num_rows, capacity) + chunk - 1) // chunk
-    out = jax.lax.fori_loop(0, num_chunks, step, out)
+    out = jax.tree.map(empty, jax.eval_shape(function, jax.eval_shape(part, jnp.uint32(0))))
+    out = for_chunks(jnp.minimum(num_rows, capacity), chunk, step, out)
     return jax.tree.map(lambda a: jax.lax.slice_in_dim(a, 0, capacity, axis=axis), out)
 
 
@@ -396,12 +466,13 @@ def fold_rows(
     rows: Any,
     *,
     num_rows: jax.Array,
-    chunk: int,
     absent: Any,
+    chunk: int = 1,
 ) -> Any:
     """Folds rows into a state, chunk by chunk, and skips chunks beyond the rows that count.
 
-    On an accelerator all rows are one chunk.
+    Row by row, XLA compiles the loop to native code on a CPU as long as a row reads and writes little: one
+    kernel instead of one for each operation. On an accelerator all rows are one chunk.
 
     Args:
       update: maps the state, the indices of the rows of a chunk, and those rows, a pytree of (chunk,)
@@ -409,9 +480,9 @@ def fold_rows(
       state: pytree of arrays.
       rows: pytree of (P,) arrays.
       num_rows: () int32, how many rows count.
-      chunk: static, rows at a time on a CPU.
       absent: pytree of numbers, what the last chunk holds beyond the rows that count: such that `update`
         makes nothing of it.
+      chunk: static, rows at a time on a CPU.
 
     Returns:
       The state after the last chunk.
@@ -421,15 +492,15 @@ def fold_rows(
     num_rows = jnp.minimum(num_rows, size)
     padded = jax.tree.map(lambda a: jnp.pad(a, (0, -size % chunk)), rows)
 
-    def step(i: jax.Array, state: Any) -> Any:
-        index = i * chunk + jnp.arange(chunk)
+    def step(start: jax.Array, state: Any) -> Any:
+        index = start.astype(jnp.int32) + jnp.arange(chunk)
 
         def part(values: jax.Array, value: Any) -> jax.Array:
-            return jnp.where(index < num_rows, jax.lax.dynamic_slice_in_dim(values, i * chunk, chunk), value)
+            return jnp.where(index < num_rows, jax.lax.dynamic_slice_in_dim(values, start, chunk), value)
 
         return update(state, index, jax.tree.map(part, padded, absent))
 
-    return jax.lax.fori_loop(0, (num_rows + chunk - 1) // chunk, step, state)
+    return for_chunks(num_rows, chunk, step, state)
 
 
 def fold_points(

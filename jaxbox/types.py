@@ -205,14 +205,28 @@ class Clusters:
 class Rectangles:
     """Rectangles in a frame turned by `angle`: u along it, v a quarter turn further."""
 
-    angle: jax.Array
-    """(P,) float32, rad, in [0, pi/2)."""
-    low: jax.Array
-    """(P, 2) float32, m: lower bounds of u and v, from the sensor."""
-    high: jax.Array
-    """(P, 2) float32, m: upper bounds of u and v."""
-    worth: jax.Array
-    """(P,) float32: the criterion (and preference) at this angle."""
+    rows: jax.Array
+    """(..., 6) float32: `low`, `high`, `angle` and `worth`, which are looked up together."""
+
+    @property
+    def low(self) -> jax.Array:
+        """(..., 2) m: lower bounds of u and v, from the sensor."""
+        return self.rows[..., :2]
+
+    @property
+    def high(self) -> jax.Array:
+        """(..., 2) m: upper bounds of u and v."""
+        return self.rows[..., 2:4]
+
+    @property
+    def angle(self) -> jax.Array:
+        """(...) rad, in [0, pi/2)."""
+        return self.rows[..., 4]
+
+    @property
+    def worth(self) -> jax.Array:
+        """(...) the criterion (and preference) at this angle."""
+        return self.rows[..., 5]
 
 
 @jax.tree_util.register_dataclass

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxbox.geometry import rectangle_iou
 from jaxbox.grouping import sort_by_group
-from jaxbox.masked import WORD_BITS, map_rows, prefix_max, prefix_sum
+from jaxbox.masked import WORD_BITS, for_chunks, map_rows, prefix_max, prefix_sum, split_index
 
 NEARBY_CELL_M = 1.0
 """Points are looked up by cells of this size."""
@@ -186,16 +186,16 @@ def _count_runs(
     end = prefix_sum(num_blocks)
     begin = end - num_blocks
 
-    def step(k: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def step(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         # The run of each block: that which begins last, before it or with it.
-        place = k * LOOKUP_BLOCKS + jnp.arange(LOOKUP_BLOCKS)
+        place = start.astype(jnp.int32) + jnp.arange(LOOKUP_BLOCKS)
         present = (num_blocks > 0) & (end > place[0]) & (begin <= place[-1])
         at = jnp.where(present, jnp.maximum(begin - place[0], 0), LOOKUP_BLOCKS)
         run = jnp.zeros(LOOKUP_BLOCKS, jnp.int32).at[at].max(jnp.arange(end.shape[0]), mode="drop")
         run = prefix_max(run)
         offset = (place - begin[run]) * BLOCK_POINTS
         left = jnp.where(place < end[-1], length[run] - offset, 0)
-        box = run // runs
+        box, _ = split_index(run, runs)
 
         def block(column: jax.Array) -> jax.Array:
             def piece(start: jax.Array) -> jax.Array:
@@ -210,9 +210,8 @@ def _count_runs(
         counts = (words[:, :, None] >> jnp.arange(NUM_KINDS) * COUNT_BITS) & (2**COUNT_BITS - 1)
         return state[0].at[box].add(counts.reshape(LOOKUP_BLOCKS, -1)), state[1].at[box].max(highest)
 
-    steps = (end[-1] + LOOKUP_BLOCKS - 1) // LOOKUP_BLOCKS
     none = jnp.zeros((num_boxes, NUM_KINDS + NUM_LEVELS), jnp.int32), jnp.zeros(num_boxes)
-    counts, highest = jax.lax.fori_loop(0, steps, step, none)
+    counts, highest = for_chunks(end[-1], LOOKUP_BLOCKS, step, none)
     return counts.astype(jnp.float32), highest
 
 
@@ -240,15 +239,19 @@ def _judge(
     recessed = upper & (jnp.minimum(face_u - facing_u * u, face_v - facing_v * v) > 0)
     # One sum counts all kinds, each in its own bits.
     kinds = (inside & low, inside & ~low, ~inside & (out < ring_m) & low, upper, recessed)
-    words = [sum(jnp.where(kind, 1 << k * COUNT_BITS, 0) for k, kind in enumerate(kinds))]
+    first = functools.reduce(
+        jnp.add, [jnp.where(kind, 1 << k * COUNT_BITS, 0) for k, kind in enumerate(kinds)]
+    )
     share = height / max_height - LOWEST_LEVEL
     level = jnp.minimum(share * (NUM_LEVELS / (1 - LOWEST_LEVEL)), NUM_LEVELS - 1).astype(jnp.int32)
     level = jnp.where(inside & low & (share > 0), level, NUM_LEVELS)
-    bit, place = 1 << level % NUM_KINDS * COUNT_BITS, level // NUM_KINDS
-    words += [jnp.where(place == k, bit, 0) for k in range(NUM_LEVELS // NUM_KINDS)]
+    place, digit = split_index(level, NUM_KINDS)
+    others = jnp.where(
+        place == jnp.arange(NUM_LEVELS // NUM_KINDS)[:, None, None], 1 << digit * COUNT_BITS, 0
+    )
     # Heights are not negative, and the bits of such numbers are in their order: integers' maxima vectorise.
     highest = jax.lax.bitcast_convert_type(jnp.where(inside & low, height, 0), jnp.int32)
-    counts = jnp.stack([jnp.sum(word, axis=1) for word in words], axis=1)
+    counts = jnp.concatenate([jnp.sum(first, axis=1)[:, None], jnp.sum(others, axis=2).T], axis=1)
     return counts, jax.lax.bitcast_convert_type(jnp.max(highest, axis=1), jnp.float32)
 
 
@@ -425,19 +428,19 @@ def suppress(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | flo
 def _overlaps(boxes: jax.Array, num_boxes: jax.Array, max_overlap: jax.Array | float) -> jax.Array:
     """(P, P / 32) uint32: which better boxes each one overlaps, as bits."""
     boxes = jnp.pad(boxes, ((0, -boxes.shape[0] % OVERLAP_TILE), (0, 0)))
-    row = jnp.arange(OVERLAP_TILE)
+    row = jnp.arange(OVERLAP_TILE, dtype=jnp.uint32)
 
     def tile(i: jax.Array, j: jax.Array, bits: jax.Array) -> jax.Array:
-        first, second = (jax.lax.dynamic_slice_in_dim(boxes, k * OVERLAP_TILE, OVERLAP_TILE) for k in (i, j))
+        first, second = (jax.lax.dynamic_slice_in_dim(boxes, k, OVERLAP_TILE) for k in (i, j))
         iou = jax.vmap(jax.vmap(rectangle_iou, (None, 0)), (0, None))(first, second)
-        better = j * OVERLAP_TILE + row < i * OVERLAP_TILE + row[:, None]
-        return jax.lax.dynamic_update_slice(bits, _pack((iou > max_overlap) & better), (i * OVERLAP_TILE, j))
+        better = j + row < i + row[:, None]
+        return jax.lax.dynamic_update_slice(bits, _pack((iou > max_overlap) & better), (i, j // OVERLAP_TILE))
 
     def tiles(i: jax.Array, bits: jax.Array) -> jax.Array:
-        return jax.lax.fori_loop(0, i + 1, functools.partial(tile, i), bits)
+        return for_chunks(i + 1, OVERLAP_TILE, functools.partial(tile, i), bits)
 
     bits = jnp.zeros((boxes.shape[0], boxes.shape[0] // OVERLAP_TILE), jnp.uint32)
-    return jax.lax.fori_loop(0, (num_boxes + OVERLAP_TILE - 1) // OVERLAP_TILE, tiles, bits)
+    return for_chunks(num_boxes, OVERLAP_TILE, tiles, bits)
 
 
 def _pack(flags: jax.Array) -> jax.Array:

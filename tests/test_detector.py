@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_masked import count_loops
 
 from benchmarks import bad_input
 from jaxbox import DetectorConfig, PointCloud, Status, detect, detector, stack_clouds, synthetic
@@ -90,6 +91,15 @@ def test_nothing_calls_back_to_the_host():
 
 
 # The same answer.
+
+
+@pytest.mark.parametrize("preset", DetectorConfig.presets().values())
+def test_thresholds_go_in_as_one_array_that_native_loops_cut_up(preset):
+    settings = detector._Settings.pack(preset)
+    unpack = jax.jit(detector._Settings.unpack)
+    assert unpack(settings) == jax.tree.map(jnp.float32, preset)
+    num_loops, num_native = count_loops(unpack, settings)
+    assert num_native == num_loops > 1
 
 
 def test_the_same_key_gives_the_same_bits_and_none_is_key_zero():

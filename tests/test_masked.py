@@ -45,6 +45,16 @@ def test_a_cpu_runs_the_toolbox_in_native_loops(toolbox):
     assert count_loops(jax.jit(toolbox), jnp.zeros(1000, jnp.int32)) == (1, 1)
 
 
+def test_at_once_copies_numbers_in_one_native_loop():
+    values = jnp.arange(float(masked.AT_ONCE))
+
+    def at_once(values):
+        return masked.at_once(lambda values: [v[0] for v in jnp.split(values, values.size)], values)
+
+    assert at_once(values) == list(range(masked.AT_ONCE))
+    assert count_loops(jax.jit(at_once), values) == (1, 1)
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_compact_lists_the_true_entries_in_order_and_then_the_sentinel(size):
     for density in (0.0, 0.3, 1.0):
@@ -100,7 +110,7 @@ def test_masked_mean_and_deviation_equal_numpy_over_the_masked_values(offset):
 def test_count_true_counts_every_mask_also_where_all_are_true(size):
     rng = np.random.default_rng(size)
     masks = [rng.random(size) < density for density in (0.0, 0.2, 1.0, 1.0, 0.7)]
-    assert [int(n) for n in masked.count_true(*map(jnp.asarray, masks))] == [mask.sum() for mask in masks]
+    assert masked.count_true(*map(jnp.asarray, masks)).tolist() == [mask.sum() for mask in masks]
 
 
 @pytest.fixture(params=["cpu", "cuda"])

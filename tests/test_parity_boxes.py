@@ -1,6 +1,7 @@
 """Parity with the reference and OpenCV: hulls, rectangles, the scene's direction, descriptors."""
 
 import dataclasses
+import functools
 import math
 import types
 
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import parity
 import pytest
+from test_masked import count_loops
 
 from jaxbox import DetectorConfig, box, descriptors, hull, reference, steps
 from jaxbox.config import HullConfig
@@ -23,10 +25,13 @@ MAX_FITS = 4096
 """Rows for the clusters of all cases of a kind."""
 
 
-@jax.jit
-def extreme_points(*rows):
+POINT_CHUNK = 4096
+
+
+@functools.partial(jax.jit, static_argnames="chunk")
+def extreme_points(*rows, chunk=1):
     bounds = hull.find_bounds(*rows, num_clusters=parity.MAX_CLUSTERS)
-    return hull.extreme_points(*rows, *bounds, num_slices=NUM_SLICES)
+    return hull.extreme_points(*rows, *bounds, num_slices=NUM_SLICES, chunk=chunk)
 
 
 def trace_hulls(points, valid):
@@ -169,20 +174,27 @@ def test_extreme_points_lose_at_most_a_slice_of_the_hull(cases):
 
 def test_what_a_list_holds_beyond_its_end_joins_no_cluster():
     rng = np.random.default_rng(0)
-    size, num = hull.POINT_CHUNK + 900, hull.POINT_CHUNK + 300
+    size, num = POINT_CHUNK + 900, POINT_CHUNK + 300
     xy = jnp.asarray(rng.normal(size=(size, 2)), jnp.float32)
     slot = jnp.asarray(rng.integers(0, parity.MAX_CLUSTERS, size))
     row, origin = jnp.arange(size), jnp.zeros((parity.MAX_CLUSTERS, 2))
-    whole = 2 * hull.POINT_CHUNK - num
+    whole = 2 * POINT_CHUNK - num
     listed = (
         jnp.pad(slot[:num], (0, whole), constant_values=parity.MAX_CLUSTERS),
         jnp.pad(row[:num], (0, whole)),
     )
     expected = extreme_points(*listed, num, xy)
-    np.testing.assert_array_equal(extreme_points(slot, row, num, xy), expected)
+    for chunk in (1, POINT_CHUNK):
+        np.testing.assert_array_equal(extreme_points(slot, row, num, xy, chunk=chunk), expected)
     expected = point_moments(*listed, num, xy, origin)
     np.testing.assert_array_equal(point_moments(slot, row, num, xy, origin), expected)
     assert expected[:, 0].sum() == num
+
+
+def test_a_cpu_describes_clusters_in_native_loops():
+    rows = jnp.zeros(900, jnp.int32), jnp.zeros(900, jnp.int32), jnp.int32(9), jnp.zeros((1000, 2))
+    assert count_loops(extreme_points, *rows) == (2, 2)
+    assert count_loops(point_moments, *rows, jnp.zeros((parity.MAX_CLUSTERS, 2))) == (1, 1)
 
 
 def fits_of(cases):

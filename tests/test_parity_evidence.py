@@ -102,8 +102,8 @@ def rectangles_of(proposals, angles):
     extents = np.array([p.extents[a] for p, a in zip(proposals, angles, strict=True)])
     worth = np.array([p.curve[a] for p, a in zip(proposals, angles, strict=True)])
     low, high = extents[:, [0, 2]], extents[:, [1, 3]]
-    rows = np.array(angles) * math.pi / 2 / 90, low, high, worth
-    return Rectangles(*(parity.pad(values, parity.MAX_CLUSTERS) for values in rows))
+    rows = np.column_stack([low, high, np.array(angles) * math.pi / 2 / 90, worth])
+    return Rectangles(parity.pad(rows, parity.MAX_CLUSTERS))
 
 
 def prior_of(vehicle, *names):

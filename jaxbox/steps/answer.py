@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from jaxbox import descriptors, hull, vehicles
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import compact, count_true, fold_rows, lookup, map_rows, store, take
+from jaxbox.masked import at_once, compact, count_true, fold_rows, lookup, map_rows, store, take
 from jaxbox.steps.boxes import Fits, max_slab_points, trace_hulls
 from jaxbox.steps.decision import Candidates
 from jaxbox.steps.points import Heights, Obstacles, Sweep
@@ -43,7 +43,13 @@ def conclude(
     center = jnp.concatenate([kept.rectangle[:, :2], (kept.bottom + kept.height / 2)[:, None]], axis=1)
     size = jnp.concatenate([kept.rectangle[:, 2:4], kept.height[:, None]], axis=1)
     largest_hull = jnp.maximum(jnp.max(hulls.num_vertices), fits.hull_vertices)
-    counts = _counts(cloud, sweep, heights, obstacles, proposals, candidates, num, largest_hull, config)
+    points = _count_points(sweep, heights, proposals, config)
+
+    def account() -> tuple[Counts, jax.Array]:
+        counts = _counts(points, cloud, obstacles, proposals, candidates, num, largest_hull)
+        return counts, _status(cloud, counts, heights, config)
+
+    counts, status = at_once(account)
 
     nowhere = jnp.full(sweep.xyz.shape[0], -1, jnp.int32)
     return Detections(
@@ -60,7 +66,7 @@ def conclude(
         ground_mask=sweep.inlier & (heights.height <= config.ground.min_height_m),
         point_component=nowhere.at[obstacles.row].set(proposals.component, mode="drop"),
         point_detection=_claim_points(nowhere, asked, owner, num_asked, obstacles, valid.shape[0]),
-        status=_status(cloud, counts, heights, obstacles, proposals, config),
+        status=status,
         counts=counts,
     )
 
@@ -81,7 +87,7 @@ def _claim_points(
         return of_point.at[row].set(jnp.where(owner < num_detections, owner, -1), mode="drop")
 
     absent = asked.shape[0], num_detections
-    return fold_rows(claim, nowhere, (asked, owner), num_rows=num_asked, chunk=OWNER_CHUNK, absent=absent)
+    return fold_rows(claim, nowhere, (asked, owner), num_rows=num_asked, absent=absent)
 
 
 def _describe(
@@ -141,23 +147,25 @@ def _owners(
     return asked, map_rows(own, asked, num_rows=num_asked, chunk=OWNER_CHUNK), num_asked
 
 
+def _count_points(sweep: Sweep, heights: Heights, proposals: Proposals, config: DetectorConfig) -> jax.Array:
+    """Points that are there, finite, in the region, no outliers, ground, overhead, and of a cluster."""
+    above = heights.height > config.ground.min_height_m
+    overhead = above & (heights.height >= config.ground.max_height_m)
+    clustered = jnp.min(proposals.cluster, axis=0) < proposals.num_points.shape[0]
+    kinds = sweep.inlier, sweep.inlier & ~above, sweep.inlier & overhead
+    return count_true(sweep.present, sweep.finite, sweep.valid, *kinds, clustered)
+
+
 def _counts(
+    points: jax.Array,
     cloud: PointCloud,
-    sweep: Sweep,
-    heights: Heights,
     obstacles: Obstacles,
     proposals: Proposals,
     candidates: Candidates,
     num_detections: jax.Array,
     largest_hull: jax.Array,
-    config: DetectorConfig,
 ) -> Counts:
-    above = heights.height > config.ground.min_height_m
-    overhead = above & (heights.height >= config.ground.max_height_m)
-    present, finite, valid, inliers, ground, overhead = count_true(
-        sweep.present, sweep.finite, sweep.valid, sweep.inlier, sweep.inlier & ~above, sweep.inlier & overhead
-    )
-    (clustered,) = count_true(jnp.min(proposals.cluster, axis=0) < proposals.num_points.shape[0])
+    present, finite, valid, inliers, ground, overhead, clustered = points
     num_obstacles = jnp.minimum(obstacles.count, obstacles.row.shape[0])
     return Counts(
         dropped_points=cloud.num_points - present,
@@ -180,14 +188,7 @@ def _counts(
     )
 
 
-def _status(
-    cloud: PointCloud,
-    counts: Counts,
-    heights: Heights,
-    obstacles: Obstacles,
-    proposals: Proposals,
-    config: DetectorConfig,
-) -> jax.Array:
+def _status(cloud: PointCloud, counts: Counts, heights: Heights, config: DetectorConfig) -> jax.Array:
     settings = config.vehicles
     not_valid = counts.dropped_points + counts.nonfinite_points + counts.out_of_range_points
     max_clusters = jnp.array([m.max_clusters for m in config.clustering.maps])

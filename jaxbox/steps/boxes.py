@@ -7,11 +7,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxbox import box, completion, evidence, hull
 from jaxbox.config import CompletionConfig, DetectorConfig
 from jaxbox.grouping import largest_first
-from jaxbox.masked import compact, lookup, map_rows, store, take
+from jaxbox.masked import compact, map_rows, split_index, store, take
 from jaxbox.steps.common import class_values, stage_options
 from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals, Trials, list_trials, longest_side
@@ -35,6 +36,9 @@ what comes in one shape XLA compiles once."""
 
 HULL_CHUNK = 32
 """Clusters whose hulls are traced at a time."""
+
+HULL_POINTS = 4096
+"""Points that are looked through for hulls at a time."""
 
 
 @jax.tree_util.register_dataclass
@@ -71,13 +75,12 @@ def best_rectangles(
 ) -> Rectangles:
     """The rectangle of each cluster at its best rotation, see `box.best_rectangles`."""
 
-    def best(rotations: tuple[jax.Array, jax.Array]) -> Rectangles:
-        rectangles = box.best_rectangles(*rotations, preference, insistence=insistence)
-        return jax.tree.map(jnp.transpose, rectangles)
+    def best(rotations: tuple[jax.Array, jax.Array]) -> jax.Array:
+        return box.best_rectangles(*rotations, preference, insistence=insistence).rows.T
 
     columns = fits.curve, fits.extents
-    rectangles = map_rows(best, columns, num_rows=num_clusters, chunk=PROPOSAL_CHUNK, axis=-1)
-    return jax.tree.map(lambda a: a.T[fits.place], rectangles)
+    rows = map_rows(best, columns, num_rows=num_clusters, chunk=PROPOSAL_CHUNK, axis=-1)
+    return Rectangles(rows.T[fits.place])
 
 
 def _hull_points(
@@ -87,7 +90,9 @@ def _hull_points(
     num_clusters = proposals.num_points.shape[0]
     cluster, row, num = _list_points(proposals, proposals.cluster < num_clusters, proposals.cluster.size)
     bounds = proposals.low[:, :2], proposals.high[:, :2]
-    index = hull.extreme_points(cluster, row, num, obstacles.xy, *bounds, num_slices=config.hull.num_slices)
+    index = hull.extreme_points(
+        cluster, row, num, obstacles.xy, *bounds, num_slices=config.hull.num_slices, chunk=HULL_POINTS
+    )
     x, y, count = trace_hulls(obstacles.xy, index, proposals.num_clusters, config)
     capacity = x.shape[0]
     start, listed = jnp.arange(num_clusters) * capacity, jnp.minimum(count, capacity)
@@ -179,14 +184,14 @@ def _scene_preference(
     settings = config.box
     size = config.clustering.maps[0].max_clusters
     rectangles = best_rectangles(fits, proposals.num_clusters, jnp.zeros(settings.num_angles))
-    rectangles = jax.tree.map(lambda a: a[:size], rectangles)
+    rectangles = Rectangles(rectangles.rows[:size])
     long = longest_side(rectangles) >= settings.direction_min_extent_m
     cluster, num = compact(long & (jnp.arange(size) < proposals.num_first), size)
-    voters = jax.tree.map(lambda a: take(a, cluster), rectangles)
+    voters = Rectangles(take(rectangles.rows, cluster))
 
     def free_length(voters: Rectangles) -> jax.Array:
         """The least of both ways that it may lie, completed away from the sensor."""
-        ways = completion.ways_to_lie(voters)
+        ways = completion.way_to_lie(voters, _EITHER_WAY)
         boxes = completion.extend_away(ways, **_class_options(jnp.zeros_like(ways.yaw, jnp.int32), config))
         rays = _cast(boxes, config.completion.num_final_rays, seen, config)
         return jnp.min(jnp.where(boxes.objective > NOT_A_BOX, rays.free_length, jnp.inf), axis=0)
@@ -221,36 +226,41 @@ def complete_trials(
     options = _class_options(trials.label, config)
     limits = {name: options[name] for name in ("max_length_m", "max_width_m")}
     if config.completion.mode != "evidence":
-        longer = completion.longer_side(jax.tree.map(lambda a: take(a, trials.cluster), readings[0]))
+        longer = completion.longer_side(Rectangles(take(readings[0].rows, trials.cluster)))
         if config.completion.mode == "none":
             return completion.keep_measured(longer, **limits)
         return completion.extend_away(longer, **options)
     assert seen is not None  # see check_settings
-    each = [completion.ways_to_lie(rectangle) for rectangle in readings]
-    ways = jax.tree.map(lambda *of_reading: jnp.concatenate(of_reading), *each)
+    rows = jnp.stack([rectangles.rows for rectangles in readings])
+    each = Rectangles(jnp.take(rows, trials.cluster, axis=1, mode="clip")[:, None])
     present = jnp.arange(trials.cluster.shape[0]) < trials.num
-    possible = present & completion.fits(_of_trial(ways, trials.cluster), **limits)
     # A second reading at the angle of the first has nothing to add.
-    angles = take(jnp.stack([r.angle for r in readings], axis=1), trials.cluster).T
-    differs = jnp.concatenate([jnp.ones_like(angles[:1], bool), angles[1:] != angles[:1]])
-    possible = possible & jnp.repeat(differs, completion.NUM_WAYS, axis=0)
-    placement, objective = _judge_ways(trials, ways, possible, points, seen, config)
+    differs = (each.angle != each.angle[0]) | (jnp.arange(len(readings)) == 0)[:, None, None]
+    possible = present & differs & completion.fits(completion.way_to_lie(each, _EITHER_WAY), **limits)
+    possible = possible.reshape(-1, possible.shape[-1])
+    placement, objective = _judge_ways(trials, rows, possible, points, seen, config)
     best = jnp.argmax(objective, axis=0)
     chosen = (best, jnp.arange(best.shape[0]))
-    way = jax.tree.map(lambda a: lookup(a, best, trials.cluster), ways)
+    way = _way(rows, best, trials.cluster)
     sizes = completion.likely_sizes(
         way, options["length_m"], options["width_m"], **_fields(config.completion, _SIDE_FIELDS)
     )
     return completion.place(way, sizes, placement[chosen], objective[chosen])
 
 
-def _of_trial(ways: completion.Ways, cluster: jax.Array) -> completion.Ways:
-    return jax.tree.map(lambda a: jnp.take(a, cluster, axis=1, mode="clip"), ways)
+_EITHER_WAY = np.arange(completion.NUM_WAYS)[:, None]
+
+
+def _way(rows: jax.Array, way: jax.Array, cluster: jax.Array) -> completion.Ways:
+    """A way of some reading of each cluster, by its number: both of the first reading, then of the second."""
+    reading, side = split_index(way, completion.NUM_WAYS)
+    row = jnp.take(rows.reshape(-1, rows.shape[-1]), reading * rows.shape[1] + cluster, axis=0, mode="clip")
+    return completion.way_to_lie(Rectangles(row), side)
 
 
 def _judge_ways(
     trials: Trials,
-    ways: completion.Ways,
+    rows: jax.Array,
     possible: jax.Array,
     points: box.PointLists,
     seen: evidence.Evidence,
@@ -263,9 +273,9 @@ def _judge_ways(
     names = ("length_m", "width_m")
 
     def judge(index: jax.Array) -> tuple[jax.Array, jax.Array]:
-        trial = index % num_trials
+        number, trial = split_index(index, num_trials)
         cluster = trials.cluster[trial]
-        way = jax.tree.map(lambda a: lookup(a, index // num_trials, cluster), ways)
+        way = _way(rows, number, cluster)
         usual = {name: class_values(config, name, trials.label[trial]) for name in names}
         boxes = completion.hypotheses(way, **usual)
         rays = _cast(boxes, settings.num_rays, seen, config)
@@ -300,7 +310,7 @@ def _in_order_of_size(
     possible, band = store((possible, band))
     flags = possible & (band == jnp.arange(NUM_BANDS)[::-1, None, None])
     index, num = compact(flags.reshape(-1), possible.size)
-    return jnp.where(index < flags.size, index % possible.size, possible.size), num
+    return jnp.where(index < flags.size, split_index(index, possible.size)[1], possible.size), num
 
 
 _SIDE_FIELDS = ("seen_length", "seen_width", "seen_weight", "length_margin_m", "width_margin_m")

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxbox import evidence, vehicles
 from jaxbox.config import DetectorConfig
 from jaxbox.geometry import wrap_yaw
-from jaxbox.masked import compact, take
+from jaxbox.masked import compact, for_chunks, take
 from jaxbox.steps.boxes import cast_rays
 from jaxbox.steps.common import class_values, stage_options
 from jaxbox.steps.points import Heights, Obstacles, height_above_ground
@@ -183,14 +183,12 @@ def _best_first(score: jax.Array, num: jax.Array) -> jax.Array:
     row = jnp.arange(size)
     padded = jnp.pad(score, (0, -size % RANK_STEP))
 
-    def step(i: jax.Array, place: jax.Array) -> jax.Array:
+    def step(start: jax.Array, place: jax.Array) -> jax.Array:
         for k in range(RANK_STEP):
-            other = i * RANK_STEP + k
+            other = start + k
             rival = padded[other]
-            place = place + ((rival > score) | ((rival == score) & (other < row)))
+            place = place + ((rival > score) | ((rival == score) & (other.astype(jnp.int32) < row)))
         return place
 
-    place = jax.lax.fori_loop(
-        0, (jnp.minimum(num, size) + RANK_STEP - 1) // RANK_STEP, step, jnp.zeros_like(row)
-    )
+    place = for_chunks(jnp.minimum(num, size), RANK_STEP, step, jnp.zeros_like(row))
     return jnp.full(size, size).at[jnp.where(score > 0, place, size)].set(row, mode="drop")

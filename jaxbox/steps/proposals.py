@@ -7,11 +7,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxbox import clustering, selection
 from jaxbox.class_priors import ClassPrior
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import compact, lookup, store, take
+from jaxbox.masked import compact, for_chunks, lookup, split_index, store, take
 from jaxbox.steps.common import stage_options
 from jaxbox.steps.points import Obstacles
 from jaxbox.types import Clusters, Label, Rectangles
@@ -92,8 +93,7 @@ def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Proposals:
 
 def _fold_chunks(step: Callable[[jax.Array, Any], Any], init: Any, obstacles: Obstacles) -> Any:
     """Calls a step with the first row of each chunk that holds points, and its state."""
-    num_chunks = (jnp.minimum(obstacles.count, obstacles.height.shape[0]) + CHUNK - 1) // CHUNK
-    return jax.lax.fori_loop(0, num_chunks, lambda i, state: step(i * CHUNK, state), init)
+    return for_chunks(jnp.minimum(obstacles.count, obstacles.height.shape[0]), CHUNK, step, init)
 
 
 def _chunk(values: jax.Array, start: jax.Array) -> jax.Array:
@@ -104,11 +104,11 @@ def _chunk(values: jax.Array, start: jax.Array) -> jax.Array:
 
 def _on_map(table: jax.Array, i: int, start: jax.Array) -> jax.Array:
     """(CHUNK,) what a table (maps, O) says of a chunk of points on map i."""
-    return jax.lax.dynamic_slice(table, (i, start), (1, CHUNK))[0]
+    return jax.lax.dynamic_slice(table, (np.uint32(i), start), (1, CHUNK))[0]
 
 
 def _store(table: jax.Array, i: int, start: jax.Array, values: jax.Array) -> jax.Array:
-    return jax.lax.dynamic_update_slice(table, values[None], (i, start))
+    return jax.lax.dynamic_update_slice(table, values[None], (np.uint32(i), start))
 
 
 def _find_cells(
@@ -211,9 +211,10 @@ def list_trials(proposals: Proposals, readings: Sequence[Rectangles], config: De
     worth_trying = present & fits & _tall(proposals, readings[0], config)
     index, num = compact(worth_trying.reshape(-1), capacity + 2 * max_large)
     present = index < worth_trying.size
+    label, cluster = split_index(index, capacity)
     return Trials(
-        cluster=jnp.where(present, index % capacity, capacity),
-        label=jnp.where(present, index // capacity, Label.CAR),
+        cluster=jnp.where(present, cluster, capacity),
+        label=jnp.where(present, label, Label.CAR),
         num=num,
     )
 
