@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbox.grouping import sort_by_group
-from jaxbox.masked import fast_max, fast_min, fold_points, fold_rows, map_rows, rows_in_use, store, take
+from jaxbox.loops import fast_max, fast_min, fold_points, fold_rows, map_rows, store
+from jaxbox.masked import rows_in_use, take
 from jaxbox.types import Rectangles
 
 CHUNK = 64

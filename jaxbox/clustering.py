@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
+from jaxbox.loops import at_once
 from jaxbox.masked import WORD_BITS, lookup, prefix_sum, take
 
 STRIP_WORDS = 32
@@ -223,13 +224,19 @@ def label_components(flags: jax.Array, row: CellRow, *, max_runs: int) -> Compon
     )
     itself = jnp.arange(max_runs, dtype=jnp.int32)
     number = prefix_sum((parent == itself) & (itself < num_runs)) - 1
-    first_run = jnp.append(runs_before[0, jnp.array(row.starts[:-1]) // STRIP], num_runs)
+
+    def count() -> tuple[jax.Array, jax.Array]:
+        first_run = [runs_before[0, start // STRIP] for start in row.starts[:-1]] + [num_runs]
+        num_of_map = [after - before for before, after in itertools.pairwise(first_run)]
+        return jnp.stack([lookup(number, run - 1) + 1 for run in first_run]), jnp.stack(num_of_map)
+
+    first, num_of_map = at_once(count)
     return Components(
         starts=starts,
         runs_before=runs_before,
         of_run=lookup(number, parent),
-        first=lookup(number, first_run - 1) + 1,
-        num_runs=jnp.diff(first_run),
+        first=first,
+        num_runs=num_of_map,
     )
 
 

@@ -6,7 +6,7 @@ import math
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import fast_max, fast_min, fold_points
+from jaxbox.loops import fast_max, fast_min, fold_points
 from jaxbox.types import NOT_A_BOX, Boxes, Rectangles
 
 INSIDE_MARGIN_M = 0.1
@@ -222,7 +222,7 @@ class Hypotheses:
     u: jax.Array
     """(C,) m: centre along the box, from the sensor."""
     v: jax.Array
-    """(3, C) m: centre across it."""
+    """(C, 3) m: centre across it."""
     length: jax.Array
     """(C,) m"""
     width: jax.Array
@@ -231,8 +231,8 @@ class Hypotheses:
     @property
     def center(self) -> jax.Array:
         """(3, C, 2) m, sensor frame."""
-        cos, sin = jnp.cos(self.yaw), jnp.sin(self.yaw)
-        return jnp.stack([cos * self.u - sin * self.v, sin * self.u + cos * self.v], axis=-1)
+        cos, sin, v = jnp.cos(self.yaw), jnp.sin(self.yaw), self.v.T
+        return jnp.stack([cos * self.u - sin * v, sin * self.u + cos * v], axis=-1)
 
 
 def hypotheses(ways: Ways, length_m: jax.Array, width_m: jax.Array) -> Hypotheses:
@@ -252,7 +252,7 @@ def hypotheses(ways: Ways, length_m: jax.Array, width_m: jax.Array) -> Hypothese
     return Hypotheses(
         yaw=ways.yaw,
         u=_extend(ways.along, length)[0],
-        v=jnp.stack(_extend(ways.across, width)),
+        v=jnp.stack(_extend(ways.across, width), axis=1),
         length=length,
         width=width,
     )
@@ -280,15 +280,15 @@ def point_agreement(
     Returns:
       (3, C) float32: the weighted sum of both.
     """
-    half_l, half_w = boxes.length / 2, boxes.width / 2
+    half_l, half_w, box_v = boxes.length / 2, boxes.width / 2, boxes.v.T
     # The sensor, at the origin, sees the faces on its side of the box; the others are far from all points.
     face_u = jnp.where(jnp.abs(boxes.u) > half_l, -jnp.sign(boxes.u) * half_l, FAR_M)
-    face_v = jnp.where(jnp.abs(boxes.v) > half_w, -jnp.sign(boxes.v) * half_w, FAR_M)
+    face_v = jnp.where(jnp.abs(box_v) > half_w, -jnp.sign(box_v) * half_w, FAR_M)
 
     cos, sin = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw)
 
     def update(total: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-        u, v = x * cos + y * sin - boxes.u, y * cos - x * sin - boxes.v
+        u, v = x * cos + y * sin - boxes.u, y * cos - x * sin - box_v
         out_u, out_v = jnp.abs(u) - half_l, jnp.abs(v) - half_w
         inside = (out_u < INSIDE_MARGIN_M) & (out_v < INSIDE_MARGIN_M)
         to_u = jnp.where(out_v < FACE_OVERHANG_M, jnp.abs(u - face_u), FAR_M)
@@ -297,7 +297,7 @@ def point_agreement(
         return total + inside_weight * inside + near_weight * near
 
     # Points that are absent are far from all boxes.
-    total = fold_points(x, y, count, jnp.zeros_like(boxes.v), update, absent=(FAR_M, FAR_M))
+    total = fold_points(x, y, count, jnp.zeros_like(box_v), update, absent=(FAR_M, FAR_M))
     return total / jnp.maximum(count, 1)
 
 

@@ -3,7 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import fold_rows, take
+from jaxbox.loops import fold_rows
+from jaxbox.masked import take
 from jaxbox.types import Descriptors
 
 MIN_VARIANCE = 1e-6

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -12,7 +11,7 @@ import numpy as np
 from jaxbox import steps
 from jaxbox.config import DetectorConfig
 from jaxbox.devices import batch_together
-from jaxbox.masked import AT_ONCE, apart, at_once
+from jaxbox.loops import AT_ONCE, apart, at_once
 from jaxbox.types import Detections, PointCloud
 
 
@@ -112,34 +111,27 @@ class _Settings:
         return jax.tree.unflatten(self.structure, thresholds)
 
 
-def _find_vehicles(cloud: PointCloud, config: _Settings, key: jax.Array) -> Detections:
+def _find_vehicles(cloud: PointCloud, settings: _Settings, key: jax.Array) -> Detections:
+    config = settings.unpack()
+
     # What a step finds is stored, or the compiler would work it out again in each later step that reads it,
     # and its scratch memory is freed: beyond 32 MB, glibc would return it to the system at each call, and
     # a sixth of the time would go into getting it back page by page.
-    def run(step: Callable[..., Any], *inputs: Any) -> Any:
-        return apart(_with_settings(step), *inputs)
 
     # 3.1 Statistical filtering, and ground removal by RANSAC (Algorithm I).
-    sweep = run(steps.select_points, cloud, config)
-    heights = run(steps.remove_ground, sweep, config, key)
-    obstacles = run(steps.gather_obstacles, sweep, heights, config)
+    sweep = apart(steps.select_points, cloud, config)
+    heights = apart(steps.remove_ground, sweep, config, key)
+    obstacles = apart(steps.gather_obstacles, sweep, heights, config)
     # 3.2 Segmentation by 3D grid subdivision (Algorithm II): several maps, several proposals.
-    proposals = run(steps.propose_clusters, obstacles, config)
+    proposals = apart(steps.propose_clusters, obstacles, config)
     # 3.3, 3.4 Convex hull and minimum rectangle over all rotations (Algorithm III).
-    fits = run(steps.fit_rectangles, obstacles, proposals, config)
+    fits = apart(steps.fit_rectangles, obstacles, proposals, config)
     # Correction for occluded objects: what the beams saw decides how each box goes on out of sight.
-    seen = run(steps.build_evidence, sweep, heights, config)
-    trials, boxes = run(steps.complete_boxes, fits, proposals, seen, config)
+    seen = apart(steps.build_evidence, sweep, heights, config)
+    trials, boxes = apart(steps.complete_boxes, fits, proposals, seen, config)
     # Vehicle decision: score, suppression, and (3.5) the descriptors of what is left.
-    candidates = run(steps.score_boxes, trials, boxes, proposals, obstacles, heights, seen, config)
-    return run(steps.conclude, cloud, sweep, heights, obstacles, proposals, fits, candidates, config)
-
-
-def _with_settings(step: Callable[..., Any]) -> Callable[..., Any]:
-    def call(*inputs: Any) -> Any:
-        return step(*[each.unpack() if isinstance(each, _Settings) else each for each in inputs])
-
-    return call
+    candidates = apart(steps.score_boxes, trials, boxes, proposals, obstacles, heights, seen, config)
+    return apart(steps.conclude, cloud, sweep, heights, obstacles, proposals, fits, candidates, config)
 
 
 _one_after_the_other = jax.custom_batching.sequential_vmap(_find_vehicles)

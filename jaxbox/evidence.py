@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox.masked import lookup, store
+from jaxbox.loops import store
+from jaxbox.masked import lookup
 
 SUPPORT_HALF_M = 100.0
 """The ground support grid covers |x|, |y| below this, in cells of 1 m."""

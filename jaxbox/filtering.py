@@ -5,7 +5,8 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import compact, for_chunks, masked_mean, masked_std, store
+from jaxbox.loops import for_chunks, store
+from jaxbox.masked import compact, masked_mean, masked_std
 
 MIN_DENSITY = 1e-6
 """Windows with less weight are empty; the smallest of one point in a corner is exp(-1.5) or so."""

@@ -6,9 +6,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxbox.capacities import GROUND_CANDIDATE_CELL_M
-from jaxbox.masked import compact, lookup, store
+from jaxbox.loops import store
+from jaxbox.masked import compact, lookup
 from jaxbox.types import GroundPlane
 
 HYPOTHESES_AT_A_TIME = 32
@@ -69,9 +71,9 @@ def cell_minima(
     lowest = jnp.full(MINIMA_TABLES * num_cells, jnp.inf).at[place].min(xyz[:, 2], mode="drop")
     lowest = jnp.min(lowest.reshape(MINIMA_TABLES, -1), axis=0)
     occupied = jnp.isfinite(lowest)
-    index = jnp.arange(rows * columns)
-    x = (index // columns + 0.5) * GROUND_CANDIDATE_CELL_M - half_x_m
-    y = (index % columns + 0.5) * GROUND_CANDIDATE_CELL_M - half_y_m
+    i, j = np.indices((rows, columns), np.float32).reshape(2, -1)
+    x = (i + 0.5) * GROUND_CANDIDATE_CELL_M - half_x_m
+    y = (j + 0.5) * GROUND_CANDIDATE_CELL_M - half_y_m
     candidates = jnp.stack([x, y, jnp.where(occupied, lowest, 0)], axis=1)
     return candidates, occupied
 

@@ -7,7 +7,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import WORD_BITS, prefix_sum, store
+from jaxbox.loops import store
+from jaxbox.masked import WORD_BITS, prefix_sum
 
 
 def largest_first(size: jax.Array, max_size: int) -> tuple[jax.Array, jax.Array]:

@@ -3,7 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from jaxbox.masked import WORD_BITS, fold_rows, lookup, store, take
+from jaxbox.loops import fold_rows, store
+from jaxbox.masked import WORD_BITS, lookup, take
 
 MIN_EXTENT_M = 1e-6
 """Clusters narrower than this are cut as if they were so wide: all their points are in one slice."""

@@ -2,13 +2,15 @@
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox.masked import lookup, prefix_sum, store, take
+from jaxbox.loops import at_once, map_rows, store
+from jaxbox.masked import lookup, prefix_sum, take
 from jaxbox.types import Clusters
 
 NUM_COLUMNS = 8
@@ -161,23 +163,25 @@ def select_clusters(
     keep = keep & (jnp.maximum(extent_x, extent_y) <= max_extent_m)
     keep = keep & (extent_x**2 + extent_y**2 >= min_extent_m**2)
     keep, order = store((keep, prefix_sum(keep)))
-    end = lookup(order, first - 1)
-    found = end[1:] - end[:-1]
-    kept = jnp.minimum(found, jnp.array(max_clusters))
+
+    def count() -> tuple[list[jax.Array], jax.Array, list[jax.Array], list[jax.Array]]:
+        end = [lookup(order, first[i] - 1) for i in range(len(max_clusters) + 1)]
+        found = [after - before for before, after in itertools.pairwise(end)]
+        kept = [jnp.minimum(each, size) for each, size in zip(found, max_clusters, strict=True)]
+        return end, jnp.stack(found), kept, list(itertools.accumulate(kept))
+
+    end, found, kept, kept_up_to = at_once(count)
     # The lists of the maps join without gaps.
     row = jnp.full_like(order, capacity)
     for i, size in enumerate(max_clusters):
         place = order - end[i]
         listed = keep & (place > 0) & (place <= size)
-        row = jnp.where(listed, place - 1 + jnp.sum(kept[:i]), row)
+        row = jnp.where(listed, place - 1 + kept_up_to[i] - kept[i], row)
     member = jnp.full(capacity, num_points.shape[0]).at[row].set(component, mode="drop")
-    upper = take(upper, member)
-    return Clusters(
-        row=row,
-        num_points=take(num_points, member),
-        num_slab=take(statistics.num_slab, member),
-        low=-upper[:, 3:6],
-        high=upper[:, :3],
-        found=found,
-        kept=kept,
-    )
+
+    def describe(member: jax.Array) -> tuple[jax.Array, ...]:
+        bounds = take(upper, member)
+        return take(num_points, member), take(statistics.num_slab, member), -bounds[:, 3:6], bounds[:, :3]
+
+    rows = map_rows(describe, member, num_rows=kept_up_to[-1])
+    return Clusters(row, *rows, found=found, kept=jnp.stack(kept))

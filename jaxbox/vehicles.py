@@ -11,7 +11,8 @@ import numpy as np
 
 from jaxbox.geometry import rectangle_iou
 from jaxbox.grouping import sort_by_group
-from jaxbox.masked import WORD_BITS, for_chunks, map_rows, prefix_max, prefix_sum, split_index
+from jaxbox.loops import for_chunks, map_rows
+from jaxbox.masked import WORD_BITS, prefix_max, prefix_sum, split_index
 
 NEARBY_CELL_M = 1.0
 """Points are looked up by cells of this size."""
@@ -53,18 +54,38 @@ OVERLAP_TILE = WORD_BITS
 class Surroundings:
     """Points in and round each box."""
 
-    num_inside: jax.Array
-    """(P,) float32: points of vehicle height inside, give or take the margin."""
-    top: jax.Array
-    """(P,) float32, m above the ground: as high as all but a few of them; 0 where there are none."""
-    num_above: jax.Array
-    """(P,) float32: points higher than the vehicle, within the box."""
-    num_ring: jax.Array
-    """(P,) float32: points of vehicle height just outside."""
-    num_upper: jax.Array
-    """(P,) float32: those inside that are as high as glass, bonnet and roof."""
-    num_recessed: jax.Array
-    """(P,) float32: those of them that lie behind the faces which the sensor sees."""
+    rows: jax.Array
+    """(P, 6) float32: what follows, in that order."""
+
+    @property
+    def num_inside(self) -> jax.Array:
+        """(P,) points of vehicle height inside, give or take the margin."""
+        return self.rows[:, 0]
+
+    @property
+    def top(self) -> jax.Array:
+        """(P,) m above the ground: as high as all but a few of them; 0 where there are none."""
+        return self.rows[:, 1]
+
+    @property
+    def num_above(self) -> jax.Array:
+        """(P,) points higher than the vehicle, within the box."""
+        return self.rows[:, 2]
+
+    @property
+    def num_ring(self) -> jax.Array:
+        """(P,) points of vehicle height just outside."""
+        return self.rows[:, 3]
+
+    @property
+    def num_upper(self) -> jax.Array:
+        """(P,) those inside that are as high as glass, bonnet and roof."""
+        return self.rows[:, 4]
+
+    @property
+    def num_recessed(self) -> jax.Array:
+        """(P,) those of them that lie behind the faces which the sensor sees."""
+        return self.rows[:, 5]
 
 
 def count_points_around(
@@ -118,13 +139,16 @@ def count_points_around(
         lambda i: i, cell_of_point, num_points, shape[0] * shape[1], room=BLOCK_POINTS
     )
     points = [jnp.take(values, order, mode="clip") for values in (xy[:, 0], xy[:, 1], height)]
-    frames = _frames(boxes, count_max_height_m, recess_m)
-    reach = jnp.abs(frames[:, 2:4]) * (frames[:, 4:5] + ring_m)
-    reach = reach + jnp.abs(frames[:, 3:1:-1]) * (frames[:, 5:6] + ring_m)
-    low = [cell(boxes[:, axis] - reach[:, axis], axis) for axis in (0, 1)]
-    high = [cell(boxes[:, axis] + reach[:, axis], axis) for axis in (0, 1)]
 
-    def look(rows: tuple[jax.Array, list[jax.Array], list[jax.Array]]) -> Surroundings:
+    def prepare(rows: tuple[jax.Array, ...]) -> tuple[jax.Array, list[jax.Array], list[jax.Array]]:
+        boxes, *others = rows
+        frames = _frames(boxes, *others)
+        reach = jnp.abs(frames[:, 2:4]) * (frames[:, 4:5] + ring_m)
+        reach = reach + jnp.abs(frames[:, 3:1:-1]) * (frames[:, 5:6] + ring_m)
+        low = [cell(boxes[:, axis] - reach[:, axis], axis) for axis in (0, 1)]
+        return frames, low, [cell(boxes[:, axis] + reach[:, axis], axis) for axis in (0, 1)]
+
+    def look(rows: tuple[jax.Array, list[jax.Array], list[jax.Array]]) -> jax.Array:
         frames, low, high = rows
         i = low[0][:, None] + jnp.arange(MAX_CELL_ROWS)
         row = jnp.minimum(i, shape[0] - 1) * shape[1]
@@ -133,9 +157,10 @@ def count_points_around(
         counts, highest = _count_runs(frames, first, length, points, margin_m, ring_m, upper_height_m)
         inside, above, ring, upper, recessed = counts[:, :NUM_KINDS].T
         top = _top(highest, stray_share * inside, counts[:, NUM_KINDS:], frames[:, -1])
-        return Surroundings(inside, top, above, ring, upper, recessed)
+        return jnp.stack([inside, top, above, ring, upper, recessed], axis=1)
 
-    return map_rows(look, (frames, low, high), num_rows=num_boxes, chunk=BOX_CHUNK)
+    rows = map_rows(prepare, (boxes, count_max_height_m, recess_m), num_rows=num_boxes)
+    return Surroundings(map_rows(look, rows, num_rows=num_boxes, chunk=BOX_CHUNK))
 
 
 def cluster_alone(num_points: jax.Array, top: jax.Array) -> Surroundings:
@@ -149,7 +174,7 @@ def cluster_alone(num_points: jax.Array, top: jax.Array) -> Surroundings:
       The surroundings.
     """
     none = jnp.zeros_like(top)
-    return Surroundings(num_points, top, num_above=none, num_ring=none, num_upper=none, num_recessed=none)
+    return Surroundings(jnp.stack([num_points, top, none, none, none, none], axis=1))
 
 
 def _frames(boxes: jax.Array, count_max_height_m: jax.Array, recess_m: jax.Array) -> jax.Array:

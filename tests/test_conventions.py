@@ -27,6 +27,7 @@ FOUNDATION = {
     "settings",
     "summary",
     "versions",
+    "loops",
     "masked",
     "grouping",
     "geometry",

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbox import grouping, masked
+from jaxbox import grouping, loops, masked
 
 SIZES = (1, 2, masked.BLOCK - 1, masked.BLOCK, masked.BLOCK + 1, 3 * masked.BLOCK + 7)
 
@@ -46,12 +46,12 @@ def test_a_cpu_runs_the_toolbox_in_native_loops(toolbox):
 
 
 def test_at_once_copies_numbers_in_one_native_loop():
-    values = jnp.arange(float(masked.AT_ONCE))
+    values = jnp.arange(float(loops.AT_ONCE))
 
     def at_once(values):
-        return masked.at_once(lambda values: [v[0] for v in jnp.split(values, values.size)], values)
+        return loops.at_once(lambda values: [v[0] for v in jnp.split(values, values.size)], values)
 
-    assert at_once(values) == list(range(masked.AT_ONCE))
+    assert at_once(values) == list(range(loops.AT_ONCE))
     assert count_loops(jax.jit(at_once), values) == (1, 1)
 
 
@@ -122,7 +122,7 @@ def backend(request, monkeypatch):
 
 @pytest.mark.parametrize("wall", ["store", "apart", "none"])
 def test_what_stands_behind_a_wall_is_computed_once_for_all_who_read_it(wall, backend):
-    walls = {"store": lambda x: masked.store(jnp.sin(x)), "apart": lambda x: masked.apart(jnp.sin, x)}
+    walls = {"store": lambda x: loops.store(jnp.sin(x)), "apart": lambda x: loops.apart(jnp.sin, x)}
     sine = walls.get(wall, jnp.sin)
 
     def read_twice(x):
@@ -144,7 +144,7 @@ def test_fold_rows_sees_each_row_once_and_no_chunk_beyond_those_that_count(num_r
 
     start = jnp.int32(0), jnp.zeros(24, jnp.int32)
     rows, count = jnp.arange(20) + 1, jnp.int32(num_rows)
-    total, seen = masked.fold_rows(add, start, rows, num_rows=count, chunk=8, absent=0)
+    total, seen = loops.fold_rows(add, start, rows, num_rows=count, chunk=8, absent=0)
     chunk = 8 if backend == "cpu" else 20
     num_seen = -(-num_rows // chunk) * chunk
     assert int(total) == num_rows * (num_rows + 1) // 2
@@ -160,7 +160,7 @@ def test_map_rows_equals_the_function_on_all_rows_and_zero_beyond_the_last_chunk
         assert row["a"].shape == (at_a_time,)
         return row["a"][:, None] * row["b"], row["a"] > 3
 
-    mapped = jax.jit(lambda num_rows: masked.map_rows(function, rows, num_rows=num_rows, chunk=chunk))
+    mapped = jax.jit(lambda num_rows: loops.map_rows(function, rows, num_rows=num_rows, chunk=chunk))
     values = np.arange(1.0, 11)
     for num_rows in (0, 1, 4, 5, 9, 10, 99):
         product, large = mapped(num_rows)
@@ -171,7 +171,7 @@ def test_map_rows_equals_the_function_on_all_rows_and_zero_beyond_the_last_chunk
 
 def test_map_rows_maps_along_the_last_axis_too(backend):
     values = jnp.arange(20.0).reshape(2, 10)
-    mapped = masked.map_rows(lambda v: 2 * v, values, num_rows=jnp.int32(5), chunk=4, axis=-1)
+    mapped = loops.map_rows(lambda v: 2 * v, values, num_rows=jnp.int32(5), chunk=4, axis=-1)
     done = jnp.arange(10) < (8 if backend == "cpu" else 10)
     np.testing.assert_array_equal(mapped, jnp.where(done, 2 * values, 0))
 
@@ -222,7 +222,7 @@ def test_fold_points_sees_each_point_of_each_cluster_once_and_in_order(backend):
         there = x < 9
         return total + jnp.where(there, jnp.stack([x, y]), 0), jnp.where(there, x, last)
 
-    fold = jax.jit(lambda counts: masked.fold_points(x, y, counts, init, update, absent=(9.0, jnp.zeros(3))))
+    fold = jax.jit(lambda counts: loops.fold_points(x, y, counts, init, update, absent=(9.0, jnp.zeros(3))))
     init = jnp.zeros((2, 3)), jnp.full(3, 7.0)
     for counts in ([0, 0, 0], [1, 0, 6], [6, 6, 6], [2, 9, 3]):
         total, last = fold(jnp.array(counts))

@@ -15,7 +15,7 @@ from test_masked import count_loops
 
 from jaxbox import DetectorConfig, box, descriptors, hull, reference, steps
 from jaxbox.config import HullConfig
-from jaxbox.masked import map_rows
+from jaxbox.loops import map_rows
 
 SETTINGS = parity.CONFIG.box
 CRITERIA = ("area", "variance", "closeness", "visible_closeness")

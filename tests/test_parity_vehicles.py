@@ -105,7 +105,7 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
 
 @jax.jit
 def score_boxes(columns, prior):
-    around = vehicles.Surroundings(*columns["around"])
+    around = vehicles.Surroundings(jnp.stack(columns["around"], axis=1))
     size = jnp.stack([columns["length"], columns["width"]], axis=1)
     early = vehicles.evidence_score(
         **{name: columns[name] for name in ("num_points", "hit", "free_length", "support", "objective")},

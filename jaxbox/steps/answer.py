@@ -8,7 +8,8 @@ import jax.numpy as jnp
 
 from jaxbox import descriptors, hull, vehicles
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import at_once, compact, count_true, fold_rows, lookup, map_rows, store, take
+from jaxbox.loops import at_once, fold_rows, map_rows, store
+from jaxbox.masked import compact, count_true, lookup, take
 from jaxbox.steps.boxes import Fits, max_slab_points, trace_hulls
 from jaxbox.steps.decision import Candidates
 from jaxbox.steps.points import Heights, Obstacles, Sweep
@@ -36,12 +37,10 @@ def conclude(
     settings = config.vehicles
     keep = vehicles.suppress(candidates.rectangle, candidates.valid, max_overlap=settings.max_overlap)
     row, num = compact(keep, settings.max_detections)
-    kept = jax.tree.map(lambda a: take(a, row), dataclasses.replace(candidates, num=keep))
+    kept = map_rows(functools.partial(_keep, candidates), row, num_rows=num)
     valid = row < keep.shape[0]
     asked, owner, num_asked = _owners(kept, valid, obstacles, proposals)
     num_points, hulls, shapes = _describe(owner, asked, num_asked, obstacles.xy, kept, num, config)
-    center = jnp.concatenate([kept.rectangle[:, :2], (kept.bottom + kept.height / 2)[:, None]], axis=1)
-    size = jnp.concatenate([kept.rectangle[:, 2:4], kept.height[:, None]], axis=1)
     largest_hull = jnp.maximum(jnp.max(hulls.num_vertices), fits.hull_vertices)
     points = _count_points(sweep, heights, proposals, config)
 
@@ -53,9 +52,9 @@ def conclude(
 
     nowhere = jnp.full(sweep.xyz.shape[0], -1, jnp.int32)
     return Detections(
-        center=jnp.where(valid[:, None], center, 0),
-        size=jnp.where(valid[:, None], size, 0),
-        yaw=kept.rectangle[:, 4],
+        center=kept.center,
+        size=kept.size,
+        yaw=kept.yaw,
         score=kept.score,
         label=kept.label,
         valid=valid,
@@ -68,6 +67,35 @@ def conclude(
         point_detection=_claim_points(nowhere, asked, owner, num_asked, obstacles, valid.shape[0]),
         status=status,
         counts=counts,
+    )
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    """The candidates that suppression leaves: K rows, zero where there is none."""
+
+    center: jax.Array  # (K, 3) m
+    size: jax.Array  # (K, 3) m
+    yaw: jax.Array  # (K,) rad
+    score: jax.Array  # (K,)
+    label: jax.Array  # (K,)
+    cluster: jax.Array  # (K,)
+    frame: jax.Array  # (K, 6) centre, direction and half the size, m, that a point of the box lies within
+
+
+def _keep(candidates: Candidates, row: jax.Array) -> Kept:
+    x, y, length, width, yaw = take(candidates.rectangle, row).T
+    bottom, height = take(candidates.bottom, row), take(candidates.height, row)
+    half_length, half_width = length / 2 + INSIDE_TOLERANCE_M, width / 2 + INSIDE_TOLERANCE_M
+    return Kept(
+        center=jnp.stack([x, y, bottom + height / 2], axis=1),
+        size=jnp.stack([length, width, height], axis=1),
+        yaw=yaw,
+        score=take(candidates.score, row),
+        label=take(candidates.label, row),
+        cluster=take(candidates.cluster, row),
+        frame=jnp.stack([x, y, jnp.cos(yaw), jnp.sin(yaw), half_length, half_width], axis=1),
     )
 
 
@@ -95,7 +123,7 @@ def _describe(
     row: jax.Array,
     num_rows: jax.Array,
     xy: jax.Array,
-    kept: Candidates,
+    kept: Kept,
     num: jax.Array,
     config: DetectorConfig,
 ) -> tuple[jax.Array, Hulls, Descriptors]:
@@ -105,13 +133,15 @@ def _describe(
     outline = hull.extreme_points(*rows, *bounds, num_slices=config.hull.num_slices)
     x, y, num_vertices = trace_hulls(xy, outline, num, config)
     vertices = jnp.stack([x.T, y.T], axis=2)
-    moments = descriptors.point_moments(*rows, kept.rectangle[:, :2])
-    shapes = descriptors.shape_descriptors(moments, hull.polygon_area(vertices), num_vertices)
+    moments = descriptors.point_moments(*rows, kept.center[:, :2])
+    shape = moments, hull.polygon_area(vertices), num_vertices
+    every = jnp.int32(num_vertices.shape[0])
+    shapes = map_rows(lambda rows: descriptors.shape_descriptors(*rows), shape, num_rows=every)
     return moments[:, 0].astype(jnp.int32), Hulls(vertices, num_vertices), shapes
 
 
 def _owners(
-    kept: Candidates, valid: jax.Array, obstacles: Obstacles, proposals: Proposals
+    kept: Kept, valid: jax.Array, obstacles: Obstacles, proposals: Proposals
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The points of clusters that have a detection, and the detection that each belongs to.
 
@@ -123,11 +153,8 @@ def _owners(
     num_detections, num_clusters = valid.shape[0], proposals.num_points.shape[0]
     rank = jnp.where(valid, jnp.arange(num_detections), num_detections)
     of_cluster = jnp.full(num_clusters + 1, num_detections).at[kept.cluster].min(rank, mode="drop")
-    x, y, length, width, yaw = kept.rectangle.T
-    half_length, half_width = length / 2 + INSIDE_TOLERANCE_M, width / 2 + INSIDE_TOLERANCE_M
-    frame = jnp.stack([x, y, jnp.cos(yaw), jnp.sin(yaw), half_length, half_width], axis=1)
     # No point is inside the box of no detection.
-    frame = jnp.pad(frame, ((0, 1), (0, 0)), constant_values=-1)
+    frame = jnp.pad(kept.frame, ((0, 1), (0, 0)), constant_values=-1)
     best = functools.reduce(jnp.minimum, [lookup(of_cluster, cluster) for cluster in proposals.cluster])
     asked, num_asked = compact(store(best < num_detections), best.shape[0])
 

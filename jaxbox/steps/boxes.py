@@ -7,16 +7,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxbox import box, completion, evidence, hull
 from jaxbox.config import CompletionConfig, DetectorConfig
-from jaxbox.grouping import largest_first
-from jaxbox.masked import compact, map_rows, split_index, store, take
+from jaxbox.grouping import largest_first, sort_by_group
+from jaxbox.loops import fold_rows, map_rows, store
+from jaxbox.masked import compact, split_index, take
 from jaxbox.steps.common import class_values, stage_options
 from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals, Trials, list_trials, longest_side
-from jaxbox.types import NOT_A_BOX, Boxes, Rectangles
+from jaxbox.types import NOT_A_BOX, Boxes, Label, Rectangles
 
 INSISTENCE = 5.0
 """How often the scene's direction counts for the second reading of a cluster: it bends a closeness only."""
@@ -24,15 +24,8 @@ INSISTENCE = 5.0
 PROPOSAL_CHUNK = 256
 """Proposals held against the evidence at a time: a loop over their points has few, wide steps."""
 
-NUM_BANDS = 4
-"""So many bands of cluster sizes put proposals in order, for chunks of like sizes."""
-
 RAY_CHUNK = 128
-"""Boxes that rays are cast over at a time."""
-
-VOTER_CHUNK = RAY_CHUNK // completion.NUM_WAYS
-"""Rectangles that may vote for the scene's direction at a time: there are few. Each may lie both ways, and
-what comes in one shape XLA compiles once."""
+"""Boxes that rays are cast over at a time, for votes as for scores: equal kernels are compiled once."""
 
 HULL_CHUNK = 32
 """Clusters whose hulls are traced at a time."""
@@ -183,20 +176,26 @@ def _scene_preference(
     """The direction that the first map's boxes, fitted without a preference, vote for."""
     settings = config.box
     size = config.clustering.maps[0].max_clusters
-    rectangles = best_rectangles(fits, proposals.num_clusters, jnp.zeros(settings.num_angles))
+    # Stored: what the compiler knows to be zeros would have kernels of its own.
+    no_preference = store(jnp.zeros(settings.num_angles))
+    rectangles = best_rectangles(fits, proposals.num_clusters, no_preference)
     rectangles = Rectangles(rectangles.rows[:size])
     long = longest_side(rectangles) >= settings.direction_min_extent_m
     cluster, num = compact(long & (jnp.arange(size) < proposals.num_first), size)
     voters = Rectangles(take(rectangles.rows, cluster))
 
-    def free_length(voters: Rectangles) -> jax.Array:
-        """The least of both ways that it may lie, completed away from the sensor."""
-        ways = completion.way_to_lie(voters, _EITHER_WAY)
-        boxes = completion.extend_away(ways, **_class_options(jnp.zeros_like(ways.yaw, jnp.int32), config))
-        rays = _cast(boxes, config.completion.num_final_rays, seen, config)
-        return jnp.min(jnp.where(boxes.objective > NOT_A_BOX, rays.free_length, jnp.inf), axis=0)
+    def complete(voter: Rectangles) -> Boxes:
+        """Both ways that it may lie, completed away from the sensor."""
+        ways = completion.way_to_lie(voter, jnp.arange(completion.NUM_WAYS)[:, None])
+        car = jnp.full_like(ways.yaw, Label.CAR, jnp.int32)
+        boxes = completion.extend_away(ways, **_class_options(car, config), **_limits(car, config))
+        return jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), boxes)
 
-    free = map_rows(free_length, voters, num_rows=num, chunk=VOTER_CHUNK)
+    boxes = map_rows(complete, voters, num_rows=num)
+    one_list = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), boxes)
+    rays = cast_rays(one_list, num * completion.NUM_WAYS, seen, config)
+    free_length = rays.free_length.reshape(boxes.objective.shape)
+    free = jnp.min(jnp.where(boxes.objective > NOT_A_BOX, free_length, jnp.inf), axis=1)
     return box.scene_preference(
         voters.angle,
         longest_side(voters),
@@ -208,11 +207,14 @@ def _scene_preference(
     )
 
 
+def _limits(label: jax.Array, config: DetectorConfig) -> dict[str, jax.Array]:
+    return {name: class_values(config, name, label) for name in ("max_length_m", "max_width_m")}
+
+
 def _class_options(label: jax.Array, config: DetectorConfig) -> dict[str, jax.Array]:
-    """Limits and likely sizes of classes, as `completion.extend_away` takes them."""
-    names = ("length_m", "width_m", "max_length_m", "max_width_m")
-    of_class = {name: class_values(config, name, label) for name in names}
-    return of_class | _fields(config.completion, _SIDE_FIELDS)
+    """What `completion.likely_sizes` asks for."""
+    usual = {name: class_values(config, name, label) for name in ("length_m", "width_m")}
+    return usual | _fields(config.completion, _SIDE_FIELDS)
 
 
 def complete_trials(
@@ -222,68 +224,80 @@ def complete_trials(
     seen: evidence.Evidence | None,
     config: DetectorConfig,
 ) -> Boxes:
-    """The box (Q,) of each trial, of those that the readings of its cluster allow."""
-    options = _class_options(trials.label, config)
-    limits = {name: options[name] for name in ("max_length_m", "max_width_m")}
-    if config.completion.mode != "evidence":
-        longer = completion.longer_side(Rectangles(take(readings[0].rows, trials.cluster)))
+    """The box (Q,) of each trial that there is, of those that the readings of its cluster allow."""
+    if config.completion.mode == "evidence":
+        assert seen is not None  # see check_settings
+        return _complete_by_evidence(trials, readings, points, seen, config)
+
+    def complete(rows: tuple[jax.Array, jax.Array]) -> Boxes:
+        cluster, label = rows
+        options = _class_options(label, config)
+        longer = completion.longer_side(Rectangles(take(readings[0].rows, cluster)))
         if config.completion.mode == "none":
-            return completion.keep_measured(longer, **limits)
-        return completion.extend_away(longer, **options)
-    assert seen is not None  # see check_settings
-    rows = jnp.stack([rectangles.rows for rectangles in readings])
-    each = Rectangles(jnp.take(rows, trials.cluster, axis=1, mode="clip")[:, None])
-    present = jnp.arange(trials.cluster.shape[0]) < trials.num
-    # A second reading at the angle of the first has nothing to add.
-    differs = (each.angle != each.angle[0]) | (jnp.arange(len(readings)) == 0)[:, None, None]
-    possible = present & differs & completion.fits(completion.way_to_lie(each, _EITHER_WAY), **limits)
-    possible = possible.reshape(-1, possible.shape[-1])
-    placement, objective = _judge_ways(trials, rows, possible, points, seen, config)
-    best = jnp.argmax(objective, axis=0)
-    chosen = (best, jnp.arange(best.shape[0]))
-    way = _way(rows, best, trials.cluster)
-    sizes = completion.likely_sizes(
-        way, options["length_m"], options["width_m"], **_fields(config.completion, _SIDE_FIELDS)
-    )
-    return completion.place(way, sizes, placement[chosen], objective[chosen])
+            return completion.keep_measured(longer, **_limits(label, config))
+        return completion.extend_away(longer, **options, **_limits(label, config))
+
+    return map_rows(complete, (trials.cluster, trials.label), num_rows=trials.num)
 
 
-_EITHER_WAY = np.arange(completion.NUM_WAYS)[:, None]
+def _complete_by_evidence(
+    trials: Trials,
+    readings: Sequence[Rectangles],
+    points: box.PointLists,
+    seen: evidence.Evidence,
+    config: DetectorConfig,
+) -> Boxes:
+    placement, objective = _judge_ways(trials, readings, points, seen, config)
+
+    def complete(of_trial: tuple[jax.Array, ...]) -> Boxes:
+        cluster, label, placement, objective = of_trial
+        best = jnp.argmax(objective, axis=1)
+        placement, objective = (
+            jnp.take_along_axis(a, best[:, None], axis=1)[:, 0] for a in (placement, objective)
+        )
+        way = _way(readings, best, cluster)
+        sizes = completion.likely_sizes(way, **_class_options(label, config))
+        return completion.place(way, sizes, placement, objective)
+
+    return map_rows(complete, (trials.cluster, trials.label, placement, objective), num_rows=trials.num)
 
 
-def _way(rows: jax.Array, way: jax.Array, cluster: jax.Array) -> completion.Ways:
+def _way(readings: Sequence[Rectangles], way: jax.Array, cluster: jax.Array) -> completion.Ways:
     """A way of some reading of each cluster, by its number: both of the first reading, then of the second."""
-    reading, side = split_index(way, completion.NUM_WAYS)
-    row = jnp.take(rows.reshape(-1, rows.shape[-1]), reading * rows.shape[1] + cluster, axis=0, mode="clip")
-    return completion.way_to_lie(Rectangles(row), side)
+    number, side = split_index(way, completion.NUM_WAYS)
+    rows = take(readings[0].rows, cluster)
+    for i, rectangles in enumerate(readings[1:], start=1):
+        rows = jnp.where(number[:, None] == i, take(rectangles.rows, cluster), rows)
+    return completion.way_to_lie(Rectangles(rows), side)
 
 
 def _judge_ways(
     trials: Trials,
-    rows: jax.Array,
-    possible: jax.Array,
+    readings: Sequence[Rectangles],
     points: box.PointLists,
     seen: evidence.Evidence,
     config: DetectorConfig,
 ) -> tuple[jax.Array, jax.Array]:
-    """The best placement of each possible way of each trial, and its J: (W, Q) each."""
+    """The best placement of each way of each trial, and its J: (Q, W) each."""
     settings = config.completion
-    num_trials = possible.shape[1]
-    index, num = _in_order_of_size(possible, take(points.count, trials.cluster), points.max_points)
-    names = ("length_m", "width_m")
+    num_ways = completion.NUM_WAYS * len(readings)
+    entry, num = _largest_first(trials, readings, points, config)
 
-    def judge(index: jax.Array) -> tuple[jax.Array, jax.Array]:
-        number, trial = split_index(index, num_trials)
-        cluster = trials.cluster[trial]
-        way = _way(rows, number, cluster)
-        usual = {name: class_values(config, name, trials.label[trial]) for name in names}
-        boxes = completion.hypotheses(way, **usual)
+    def prepare(entry: jax.Array) -> tuple[completion.Hypotheses, jax.Array, jax.Array]:
+        trial, number = split_index(entry, num_ways)
+        cluster, label = take(trials.cluster, trial), take(trials.label, trial)
+        way = _way(readings, number, cluster)
+        usual = {name: class_values(config, name, label) for name in ("length_m", "width_m")}
+        return completion.hypotheses(way, **usual), way.worth, cluster
+
+    def judge(rows: tuple[completion.Hypotheses, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        boxes, worth, cluster = rows
         rays = _cast(boxes, settings.num_rays, seen, config)
         agreement = completion.point_agreement(
             boxes, *points.table(cluster), **_fields(settings, _POINT_FIELDS)
         )
         return completion.choose_placement(
-            way.worth,
+            worth,
             agreement,
             hit=rays.hit,
             free=rays.free,
@@ -291,26 +305,46 @@ def _judge_ways(
             **_fields(settings, _OBJECTIVE_FIELDS),
         )
 
-    placement, objective = map_rows(judge, index, num_rows=num, chunk=PROPOSAL_CHUNK)
-    everywhere = jnp.zeros(possible.size, jnp.int32).at[index].set(placement, mode="drop")
-    judged = jnp.full(possible.size, NOT_A_BOX).at[index].set(objective, mode="drop")
-    return everywhere.reshape(possible.shape), judged.reshape(possible.shape)
+    def note(tables: Any, _: jax.Array, rows: tuple[jax.Array, ...]) -> Any:
+        entry, *found = rows
+        return tuple(a.at[entry].set(value, mode="drop") for a, value in zip(tables, found, strict=True))
+
+    prepared = map_rows(prepare, entry, num_rows=num)
+    judged = map_rows(judge, prepared, num_rows=num, chunk=PROPOSAL_CHUNK)
+    nothing = jnp.zeros(entry.shape, jnp.int32), jnp.full(entry.shape, NOT_A_BOX)
+    of_entry = fold_rows(note, nothing, (entry, *judged), num_rows=num, absent=(entry.size, 0, 0.0))
+    placement, objective = (a.reshape(-1, num_ways) for a in of_entry)
+    return placement, objective
 
 
-def _in_order_of_size(
-    possible: jax.Array, num_points: jax.Array, max_points: int
+def _largest_first(
+    trials: Trials, readings: Sequence[Rectangles], points: box.PointLists, config: DetectorConfig
 ) -> tuple[jax.Array, jax.Array]:
-    """Entries of a table (W, Q) that are True, those of trials with many points roughly first; their number.
+    """The possible ways of all trials, those of trials with many points first; their number.
 
-    A loop over the points of a chunk of trials ends with the largest of them: so like sizes belong together.
-    Bands do for that; the exact order of `largest_first` would be one more sort.
+    A loop over the points of a chunk of them ends with the largest: so like sizes belong together.
     """
-    band = jnp.minimum(num_points * NUM_BANDS // max_points, NUM_BANDS - 1)
-    # Stored, or each word of flags would work it out bit by bit.
-    possible, band = store((possible, band))
-    flags = possible & (band == jnp.arange(NUM_BANDS)[::-1, None, None])
-    index, num = compact(flags.reshape(-1), possible.size)
-    return jnp.where(index < flags.size, split_index(index, possible.size)[1], possible.size), num
+    sides = [jnp.int32(side) for side in range(completion.NUM_WAYS)]
+
+    def rank(rows: tuple[jax.Array, jax.Array]) -> jax.Array:
+        cluster, label = rows
+        first, *others = (Rectangles(take(rectangles.rows, cluster)) for rectangles in readings)
+        limits = _limits(label, config)
+        # A second reading at the angle of the first has nothing to add.
+        new = [jnp.ones_like(first.angle, bool), *(other.angle != first.angle for other in others)]
+        possible = [
+            is_new & completion.fits(completion.way_to_lie(rectangle, side), **limits)
+            for rectangle, is_new in zip((first, *others), new, strict=True)
+            for side in sides
+        ]
+        missing = points.max_points - jnp.minimum(take(points.total, cluster), points.max_points)
+        return jnp.where(jnp.stack(possible, axis=1), missing[:, None], points.max_points)
+
+    ranks = map_rows(rank, (trials.cluster, trials.label), num_rows=trials.num)
+    num_entries = trials.num * ranks.shape[1]
+    entry, begin, _ = sort_by_group(lambda i: i, ranks.reshape(-1), num_entries, points.max_points + 1)
+    # Clusters have points, so that only what is not possible comes last.
+    return entry, begin[points.max_points]
 
 
 _SIDE_FIELDS = ("seen_length", "seen_width", "seen_weight", "length_margin_m", "width_margin_m")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,8 @@ import jax.numpy as jnp
 from jaxbox import evidence, vehicles
 from jaxbox.config import DetectorConfig
 from jaxbox.geometry import wrap_yaw
-from jaxbox.masked import compact, for_chunks, take
+from jaxbox.loops import for_chunks, map_rows
+from jaxbox.masked import compact, take
 from jaxbox.steps.boxes import cast_rays
 from jaxbox.steps.common import class_values, stage_options
 from jaxbox.steps.points import Heights, Obstacles, height_above_ground
@@ -45,20 +47,35 @@ def score_boxes(
     config: DetectorConfig,
 ) -> Candidates:
     """Scores the boxes by rays and size, then the best of them by what surrounds them."""
-    settings = config.vehicles
-    score = _early_score(trials, boxes, proposals, seen, config)
-    chosen, num = _choose(score, settings.max_candidates, settings.min_score)
-    rectangle = jnp.concatenate(
-        [boxes.center, jnp.stack([boxes.length, boxes.width, wrap_yaw(boxes.yaw)], axis=1)], axis=1
-    )
-    rectangle = take(rectangle, chosen)
-    label, cluster = take(trials.label, chosen), take(trials.cluster, chosen, proposals.num_points.shape[0])
-    prior = functools.partial(class_values, config, label=label)
+    score = _early_scores(trials, boxes, proposals, seen, config)
+    chosen, num = _choose(score, config.vehicles.max_candidates, config.vehicles.min_score)
+
+    def pick(chosen: jax.Array) -> tuple[jax.Array, ...]:
+        box = jax.tree.map(lambda a: take(a, chosen), boxes)
+        size = jnp.stack([box.length, box.width, wrap_yaw(box.yaw)], axis=1)
+        rectangle = jnp.concatenate([box.center, size], axis=1)
+        return rectangle, take(trials.label, chosen), take(trials.cluster, chosen), take(score, chosen)
+
+    picked = map_rows(pick, chosen, num_rows=num)
+    rectangle, label, cluster, _ = picked
     around = _look_around(rectangle, label, cluster, num, proposals, obstacles, config)
-    rho = jnp.linalg.norm(rectangle[:, :2], axis=1)
+    finish = functools.partial(_finish, proposals=proposals, heights=heights, config=config)
+    candidates = map_rows(finish, (*picked, around), num_rows=num)
+    order = _best_first(candidates.score, num)
+    ordered = map_rows(lambda row: jax.tree.map(lambda a: take(a, row), candidates), order, num_rows=num)
+    return dataclasses.replace(ordered, num=num)
+
+
+def _finish(
+    rows: tuple[Any, ...], proposals: Proposals, heights: Heights, config: DetectorConfig
+) -> Candidates:
+    """Candidates with their score and height, in the order that they came in."""
+    rectangle, label, cluster, score, around = rows
+    settings = config.vehicles
+    prior = functools.partial(class_values, config, label=label)
     late = vehicles.surroundings_score(
         around,
-        rho,
+        jnp.linalg.norm(rectangle[:, :2], axis=1),
         top_grade=settings.top_grade,
         ring_weight=settings.ring_weight,
         overhead_weight=settings.overhead_weight,
@@ -77,12 +94,9 @@ def score_boxes(
         height = take(proposals.high[:, 2], cluster) - above
     flat = jnp.concatenate([rectangle[:, :2], jnp.zeros_like(rectangle[:, :1])], axis=1)
     bottom = above - height_above_ground(flat, heights.planes, heights.surface, config)
-    total = jnp.where(chosen < score.shape[0], take(score, chosen) * late, 0)
+    total = score * late
     total = jnp.where(total > settings.min_score, total, 0)
-    order = _best_first(total, num)
-    unsorted = Candidates(rectangle, bottom, height, total, label, cluster, total > 0, jnp.zeros_like(label))
-    ordered = jax.tree.map(lambda a: take(a, order), unsorted)
-    return dataclasses.replace(ordered, num=num)
+    return Candidates(rectangle, bottom, height, total, label, cluster, total > 0, jnp.zeros_like(label))
 
 
 def _look_around(
@@ -115,7 +129,7 @@ def _look_around(
     )
 
 
-def _early_score(
+def _early_scores(
     trials: Trials,
     boxes: Boxes,
     proposals: Proposals,
@@ -123,15 +137,34 @@ def _early_score(
     config: DetectorConfig,
 ) -> jax.Array:
     """(Q,) the part of the score that needs no look at the surroundings; no other part exceeds 1."""
+    rays = None if seen is None else cast_rays(boxes, trials.num, seen, config)
+
+    def score(rows: tuple[Boxes, jax.Array, jax.Array, evidence.RayFractions | None]) -> jax.Array:
+        boxes, label, cluster, rays = rows
+        ones = jnp.ones_like(boxes.yaw)
+        hit, free_length, support = ones, 0 * ones, config.vehicles.support_points * ones
+        if seen is not None and rays is not None:
+            hit, free_length = rays.hit, rays.free_length
+            support = evidence.ground_support(seen, boxes.center)
+        return _early_score(
+            boxes, label, take(proposals.num_points, cluster), hit, free_length, support, config
+        )
+
+    scores = map_rows(score, (boxes, trials.label, trials.cluster, rays), num_rows=trials.num)
+    return jnp.where(jnp.arange(scores.shape[0]) < trials.num, scores, 0)
+
+
+def _early_score(
+    boxes: Boxes,
+    label: jax.Array,
+    num_points: jax.Array,
+    hit: jax.Array,
+    free_length: jax.Array,
+    support: jax.Array,
+    config: DetectorConfig,
+) -> jax.Array:
     settings = config.vehicles
-    prior = functools.partial(class_values, config, label=trials.label)
-    num_points = take(proposals.num_points, trials.cluster)
-    ones = jnp.ones_like(boxes.yaw)
-    hit, free_length, support = ones, 0 * ones, settings.support_points * ones
-    if seen is not None:
-        rays = cast_rays(boxes, trials.num, seen, config)
-        hit, free_length = rays.hit, rays.free_length
-        support = evidence.ground_support(seen, boxes.center)
+    prior = functools.partial(class_values, config, label=label)
     score = vehicles.evidence_score(
         num_points=num_points,
         hit=hit,
@@ -156,8 +189,8 @@ def _early_score(
         **{name: prior(name) for name in ("length_below_m", "length_above_m", "width_tolerance_m")},
     )
     score = score * prior("prior_weight")
-    present = (jnp.arange(score.shape[0]) < trials.num) & (boxes.objective > NOT_A_BOX)
-    return jnp.where(present & (jnp.max(boxes.measured, axis=1) >= settings.min_extent_m), score, 0)
+    large_enough = jnp.max(boxes.measured, axis=1) >= settings.min_extent_m
+    return jnp.where((boxes.objective > NOT_A_BOX) & large_enough, score, 0)
 
 
 def _choose(score: jax.Array, capacity: int, min_score: jax.Array | float) -> tuple[jax.Array, jax.Array]:
@@ -190,5 +223,5 @@ def _best_first(score: jax.Array, num: jax.Array) -> jax.Array:
             place = place + ((rival > score) | ((rival == score) & (other.astype(jnp.int32) < row)))
         return place
 
-    place = for_chunks(jnp.minimum(num, size), RANK_STEP, step, jnp.zeros_like(row))
+    place = for_chunks(num, RANK_STEP, step, jnp.zeros_like(row), capacity=size)
     return jnp.full(size, size).at[jnp.where(score > 0, place, size)].set(row, mode="drop")

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 
 from jaxbox import filtering, ground
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import compact, store, take
+from jaxbox.loops import store
+from jaxbox.masked import compact, take
 from jaxbox.steps.common import stage_options
 from jaxbox.types import GroundPlane, PointCloud
 

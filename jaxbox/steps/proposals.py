@@ -7,12 +7,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxbox import clustering, selection
 from jaxbox.class_priors import ClassPrior
 from jaxbox.config import DetectorConfig
-from jaxbox.masked import compact, for_chunks, lookup, split_index, store, take
+from jaxbox.loops import fold_rows, for_chunks, map_rows, store
+from jaxbox.masked import compact, lookup, split_index, take
 from jaxbox.steps.common import stage_options
 from jaxbox.steps.points import Obstacles
 from jaxbox.types import Clusters, Label, Rectangles
@@ -93,7 +93,12 @@ def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Proposals:
 
 def _fold_chunks(step: Callable[[jax.Array, Any], Any], init: Any, obstacles: Obstacles) -> Any:
     """Calls a step with the first row of each chunk that holds points, and its state."""
-    return for_chunks(jnp.minimum(obstacles.count, obstacles.height.shape[0]), CHUNK, step, init)
+    return for_chunks(obstacles.count, CHUNK, step, init, capacity=obstacles.height.shape[0])
+
+
+def _for_maps(num_maps: int, step: Callable[[jax.Array, Any], Any], state: Any) -> Any:
+    """Map after map: what is written out for each would have kernels for each."""
+    return jax.lax.fori_loop(jnp.uint32(0), jnp.uint32(num_maps), step, state)
 
 
 def _chunk(values: jax.Array, start: jax.Array) -> jax.Array:
@@ -102,13 +107,13 @@ def _chunk(values: jax.Array, start: jax.Array) -> jax.Array:
     return jax.lax.dynamic_slice_in_dim(whole, start, CHUNK)
 
 
-def _on_map(table: jax.Array, i: int, start: jax.Array) -> jax.Array:
+def _on_map(table: jax.Array, i: jax.Array, start: jax.Array) -> jax.Array:
     """(CHUNK,) what a table (maps, O) says of a chunk of points on map i."""
-    return jax.lax.dynamic_slice(table, (np.uint32(i), start), (1, CHUNK))[0]
+    return jax.lax.dynamic_slice(table, (i, start), (1, CHUNK))[0]
 
 
-def _store(table: jax.Array, i: int, start: jax.Array, values: jax.Array) -> jax.Array:
-    return jax.lax.dynamic_update_slice(table, values[None], (np.uint32(i), start))
+def _store(table: jax.Array, i: jax.Array, start: jax.Array, values: jax.Array) -> jax.Array:
+    return jax.lax.dynamic_update_slice(table, values[None], (i, start))
 
 
 def _find_cells(
@@ -135,7 +140,7 @@ def _find_cells(
         xy = store(warp(_chunk(obstacles.xy, start)))
         for i, cell in enumerate(find(xy, _chunk(obstacles.height, start), present)):
             flags = flags.at[cells.flag(cell)].set(1, mode="promise_in_bounds")
-            table = _store(table, i, start, cell)
+            table = _store(table, jnp.uint32(i), start, cell)
         return table, flags
 
     size = obstacles.height.shape[0]
@@ -147,11 +152,11 @@ def _find_components(obstacles: Obstacles, cell: jax.Array, components: clusteri
     """The component of each point on each map, (maps, O)."""
 
     def step(start: jax.Array, table: jax.Array) -> jax.Array:
-        for i in range(len(cell)):
+        def on_map(i: jax.Array, table: jax.Array) -> jax.Array:
             # Look-ups do not vectorise within the write of a chunk (XLA, CPU).
-            component = store(components.at(_on_map(cell, i, start)))
-            table = _store(table, i, start, component)
-        return table
+            return _store(table, i, start, store(components.at(_on_map(cell, i, start))))
+
+        return _for_maps(len(cell), on_map, table)
 
     return _fold_chunks(step, jnp.zeros_like(cell), obstacles)
 
@@ -172,14 +177,16 @@ def _find_clusters(
     code = 2 * row + take(all_fitted, row)
 
     def step(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        table, fitted = state
-        in_slab = _in_slab(_chunk(obstacles.height, start), config)
-        for i in range(len(component)):
+        in_slab = store(_in_slab(_chunk(obstacles.height, start), config))
+
+        def on_map(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            table, fitted = state
             found = lookup(code, _on_map(component, i, start))
             cluster, every = found >> 1, found & 1 == 1
-            table = _store(table, i, start, cluster)
-            fitted = _store(fitted, i, start, (cluster < num_clusters) & (in_slab | every))
-        return table, fitted
+            is_fitted = (cluster < num_clusters) & (in_slab | every)
+            return _store(table, i, start, cluster), _store(fitted, i, start, is_fitted)
+
+        return _for_maps(len(component), on_map, state)
 
     init = jnp.full(component.shape, num_clusters), jnp.zeros(component.shape, bool)
     return _fold_chunks(step, init, obstacles)
@@ -205,10 +212,24 @@ class Trials:
 def list_trials(proposals: Proposals, readings: Sequence[Rectangles], config: DetectorConfig) -> Trials:
     """Lists cars first, then vans, then trucks, without gaps: those that a gate would not refuse anyway."""
     capacity, max_large = proposals.num_points.shape[0], proposals.large.shape[0]
-    row = jnp.arange(capacity)
-    present = jnp.stack([row < proposals.num_clusters, *[_is_among(proposals.large, capacity)] * 2])
-    fits = jnp.stack([_fits(prior, readings, config) for prior in config.vehicles.classes])
-    worth_trying = present & fits & _tall(proposals, readings[0], config)
+    is_large = fold_rows(
+        lambda flags, _, row: flags.at[row].set(True, mode="drop"),
+        jnp.zeros(capacity, bool),
+        proposals.large,
+        num_rows=proposals.num_large,
+        absent=capacity,
+    )
+
+    def is_worth_trying(rows: tuple[jax.Array, ...]) -> jax.Array:
+        is_large, high, *each = rows
+        rectangles = [Rectangles(rows) for rows in each]
+        fits = [_fits(prior, rectangles, config) for prior in config.vehicles.classes]
+        tried = jnp.stack([fits[0], *(is_large & other for other in fits[1:])], axis=1)
+        return tried & _tall(high[:, 2], rectangles[0], config)[:, None]
+
+    rows = is_large, proposals.high, *(rectangles.rows for rectangles in readings)
+    worth_trying = map_rows(is_worth_trying, rows, num_rows=proposals.num_clusters).T
+    worth_trying = worth_trying & (jnp.arange(capacity) < proposals.num_clusters)
     index, num = compact(worth_trying.reshape(-1), capacity + 2 * max_large)
     present = index < worth_trying.size
     label, cluster = split_index(index, capacity)
@@ -217,10 +238,6 @@ def list_trials(proposals: Proposals, readings: Sequence[Rectangles], config: De
         label=jnp.where(present, label, Label.CAR),
         num=num,
     )
-
-
-def _is_among(rows: jax.Array, size: int) -> jax.Array:
-    return jnp.zeros(size, bool).at[rows].set(True, mode="drop")
 
 
 def _fits(prior: ClassPrior, readings: Sequence[Rectangles], config: DetectorConfig) -> jax.Array:
@@ -233,12 +250,12 @@ def _fits(prior: ClassPrior, readings: Sequence[Rectangles], config: DetectorCon
     return fits
 
 
-def _tall(proposals: Proposals, rectangles: Rectangles, config: DetectorConfig) -> jax.Array:
+def _tall(high: jax.Array, rectangles: Rectangles, config: DetectorConfig) -> jax.Array:
     """(P,) whether a cluster can be (the lower part of) the lowest class, given the beams' spacing."""
     vehicles = config.vehicles
     rho = jnp.linalg.norm((rectangles.low + rectangles.high) / 2, axis=1)
     lowest = functools.reduce(jnp.minimum, [prior.min_height_m for prior in vehicles.classes])
-    return proposals.high[:, 2] + vehicles.top_grade * rho > lowest - LOWER_PART_M
+    return high + vehicles.top_grade * rho > lowest - LOWER_PART_M
 
 
 def longest_side(rectangles: Rectangles) -> jax.Array:
