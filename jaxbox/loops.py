@@ -133,7 +133,7 @@ def map_rows(
     Work is proportional to the rows that are there, not to the capacity, and what a chunk needs
     stays in the cache. Row by row, XLA compiles the loop to native code on a CPU as long as a row reads and
     writes little: for some hundred rows that is as fast as a dozen kernels, and far less to compile. On an
-    accelerator all rows are one chunk.
+    accelerator the function is called once, for all rows.
 
     Args:
       function: maps a pytree of (chunk, ...) arrays to another one.
@@ -143,11 +143,13 @@ def map_rows(
       axis: static, 0 or -1: the axis of all arrays along which the rows lie; -1 for (..., P) arrays.
 
     Returns:
-      Pytree of (P, ...) arrays; rows of chunks beyond `num_rows` are zero.
+      Pytree of (P, ...) arrays; rows of chunks beyond `num_rows` are zero on a CPU, and what the function
+      makes of them on an accelerator.
     """
+    if on_accelerator():
+        return function(rows)
     function = jax.jit(function, inline=True)  # Traced once, for its shapes and for the loop.
     capacity = jax.tree.leaves(rows)[0].shape[axis]
-    chunk = at_a_time(chunk, max(chunk, capacity))
     missing = -capacity % chunk
 
     def extended(a: jax.Array) -> jax.Array:
@@ -201,19 +203,23 @@ def fold_rows(
       The state after the last chunk.
     """
     size = jax.tree.leaves(rows)[0].shape[0]
-    chunk = at_a_time(chunk, max(chunk, size))
+    num_rows = jnp.minimum(num_rows, size)
+
+    def fold(state: Any, index: jax.Array, rows: Any) -> Any:
+        there = index < num_rows
+        return update(state, index, jax.tree.map(lambda a, none: jnp.where(there, a, none), rows, absent))
+
+    if on_accelerator():
+        return fold(state, jnp.arange(size), rows)
     padded = jax.tree.map(lambda a: jnp.pad(a, (0, -size % chunk)), rows)
 
     def step(start: jax.Array, state: Any) -> Any:
         index = start.astype(jnp.int32) + jnp.arange(chunk)
+        return fold(
+            state, index, jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, start, chunk), padded)
+        )
 
-        def part(values: jax.Array, value: Any) -> jax.Array:
-            found = jax.lax.dynamic_slice_in_dim(values, start, chunk)
-            return found if chunk == 1 else jnp.where(index < jnp.minimum(num_rows, size), found, value)
-
-        return update(state, index, jax.tree.map(part, padded, absent))
-
-    return for_chunks(num_rows, chunk, step, state, capacity=size)
+    return for_chunks(num_rows, chunk, step, state)
 
 
 def fold_points(
