@@ -100,6 +100,7 @@ class _Settings:
         )
 
     def unpack(self) -> DetectorConfig:
+        # Cut up together: each threshold that a loop reads would else be a kernel of its own.
         values = jnp.asarray(self.thresholds)
 
         def cut_up(numbers: range) -> list[jax.Array]:

@@ -30,8 +30,8 @@ def find_bounds(
     def widen(bounds: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
         slot, row = rows
         # Low bounds are high ones of the points turned by half a turn.
-        both = jnp.concatenate([take(xy, row), -take(xy, row)], axis=1)
-        return bounds.at[slot].max(both, mode="drop")
+        point = take(xy, row)
+        return bounds.at[slot].max(jnp.concatenate([point, -point], axis=1), mode="drop")
 
     none = jnp.full((num_clusters, 4), -jnp.inf)
     absent = num_clusters, xy.shape[0]

@@ -55,14 +55,9 @@ def apart(function: Callable[..., Any], *operands: Any) -> Any:
     """
     if on_accelerator():
         return function(*operands)
-    traced_once = jax.jit(function, inline=True)
-    shapes = jax.eval_shape(traced_once, *operands)
+    function = jax.jit(function, inline=True)  # Traced once, for both branches.
     always = jax.lax.optimization_barrier(jnp.bool_(True))
-    return jax.lax.cond(
-        always,
-        lambda: traced_once(*operands),
-        lambda: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes),
-    )
+    return jax.lax.cond(always, lambda: function(*operands), lambda: _zeros_of(function, *operands))
 
 
 def at_once(function: Callable[..., Any], *operands: Any) -> Any:
@@ -82,12 +77,16 @@ def at_once(function: Callable[..., Any], *operands: Any) -> Any:
         return function(*operands)
     function = jax.jit(function, inline=True)  # Traced once, for its shapes and for the loop.
     once = jax.lax.optimization_barrier(jnp.bool_(True))
-    shapes = jax.eval_shape(function, *operands)
-    nothing = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
-    turn = jax.lax.while_loop(
-        lambda state: state[0], lambda _: (jnp.bool_(False), function(*operands)), (once, nothing)
-    )
-    return turn[1]
+
+    def turn(_: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        return jnp.bool_(False), function(*operands)
+
+    return jax.lax.while_loop(lambda state: state[0], turn, (once, _zeros_of(function, *operands)))[1]
+
+
+def _zeros_of(function: Callable[..., Any], *operands: Any) -> Any:
+    """Zeros in the shapes of a function's result."""
+    return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, *operands))
 
 
 def for_chunks(

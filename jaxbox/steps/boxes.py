@@ -211,10 +211,13 @@ def _limits(label: jax.Array, config: DetectorConfig) -> dict[str, jax.Array]:
     return {name: class_values(config, name, label) for name in ("max_length_m", "max_width_m")}
 
 
+def _usual_size(label: jax.Array, config: DetectorConfig) -> dict[str, jax.Array]:
+    return {name: class_values(config, name, label) for name in ("length_m", "width_m")}
+
+
 def _class_options(label: jax.Array, config: DetectorConfig) -> dict[str, jax.Array]:
     """What `completion.likely_sizes` asks for."""
-    usual = {name: class_values(config, name, label) for name in ("length_m", "width_m")}
-    return usual | _fields(config.completion, _SIDE_FIELDS)
+    return _usual_size(label, config) | _fields(config.completion, _SIDE_FIELDS)
 
 
 def complete_trials(
@@ -231,11 +234,11 @@ def complete_trials(
 
     def complete(rows: tuple[jax.Array, jax.Array]) -> Boxes:
         cluster, label = rows
-        options = _class_options(label, config)
+        limits = _limits(label, config)
         longer = completion.longer_side(Rectangles(take(readings[0].rows, cluster)))
         if config.completion.mode == "none":
-            return completion.keep_measured(longer, **_limits(label, config))
-        return completion.extend_away(longer, **options, **_limits(label, config))
+            return completion.keep_measured(longer, **limits)
+        return completion.extend_away(longer, **_class_options(label, config), **limits)
 
     return map_rows(complete, (trials.cluster, trials.label), num_rows=trials.num)
 
@@ -287,8 +290,7 @@ def _judge_ways(
         trial, number = split_index(entry, num_ways)
         cluster, label = take(trials.cluster, trial), take(trials.label, trial)
         way = _way(readings, number, cluster)
-        usual = {name: class_values(config, name, label) for name in ("length_m", "width_m")}
-        return completion.hypotheses(way, **usual), way.worth, cluster
+        return completion.hypotheses(way, **_usual_size(label, config)), way.worth, cluster
 
     def judge(rows: tuple[completion.Hypotheses, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         boxes, worth, cluster = rows
