@@ -10,29 +10,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+
+from jaxbox.loops import for_chunks
 
 BLOCK = 512
 """Columns of sums in two levels."""
 
-PREFIX_UNROLL = 4, 3, 2, 1
-"""Numbers taken in one step of the loop of a prefix sum, the most that leave no remainder, which would take
-kernels of its own. Four are twice as fast as one."""
+UNROLL = 4, 3, 2, 1
+"""Numbers taken in one turn of a loop over them, the most that leave no remainder, which would take kernels
+of its own. Four are twice as fast as one."""
 
 WORD_BITS = 32
 """Bits of a word of a set of flags."""
-
-BYTE_BITS = 8
-"""Flags that are compacted at a time."""
-
-_PLACES_OF_BYTE = np.array(
-    [
-        [k for k in range(BYTE_BITS) if value >> k & 1] + [0] * (BYTE_BITS - value.bit_count())
-        for value in range(2**BYTE_BITS)
-    ],
-    np.uint8,
-)
-"""(256, 8): where the set bits of each byte are, lowest first; 0 beyond."""
 
 
 def prefix_sum(values: jax.Array) -> jax.Array:
@@ -68,17 +57,25 @@ def prefix_max(values: jax.Array) -> jax.Array:
 
 
 def _scan_one_by_one(combine: Callable[..., jax.Array], values: jax.Array) -> jax.Array:
-    """Number after number: XLA compiles so small a loop to native code on the CPU."""
-
     def step(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         total, totals = state
         total = combine(total, values[i].astype(jnp.int32))
         return total, totals.at[i].set(total, mode="promise_in_bounds")
 
     size = values.shape[0]
-    unroll = next(num for num in PREFIX_UNROLL if size % num == 0)
-    init = jnp.int32(0), jnp.zeros(size, jnp.int32)
-    return jax.lax.fori_loop(0, size, step, init, unroll=unroll)[1]
+    return _one_by_one(size, step, (jnp.int32(0), jnp.zeros(size, jnp.int32)))[1]
+
+
+def _one_by_one(size: int, step: Callable[[jax.Array, Any], Any], state: Any) -> Any:
+    """Calls a step with each index, () uint32, and the state: XLA compiles so small a loop to native code."""
+    unroll = next(num for num in UNROLL if size % num == 0)
+
+    def steps(start: jax.Array, state: Any) -> Any:
+        for k in range(unroll):
+            state = step(start + k, state)
+        return state
+
+    return for_chunks(jnp.uint32(size), unroll, steps, state)
 
 
 def _sum_in_blocks(values: jax.Array) -> jax.Array:
@@ -119,7 +116,7 @@ def compact(mask: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
     """
     return jax.lax.platform_dependent(
         mask,
-        cpu=functools.partial(_compact_by_bytes, capacity=capacity),
+        cpu=functools.partial(_compact_one_by_one, capacity=capacity),
         default=functools.partial(_compact_at_once, capacity=capacity),
     )
 
@@ -133,30 +130,21 @@ def _compact_at_once(mask: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.
     return index, order[-1]
 
 
-def _compact_by_bytes(mask: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.Array]:
-    """Byte after byte of flags: XLA compiles so small a loop to native code on the CPU.
-
-    Each writes eight indices, of which as many count as it has flags: the next byte writes over the others.
-    """
-    size = mask.shape[0]
-    flags = jnp.pad(mask, (0, -size % BYTE_BITS)).reshape(-1, BYTE_BITS)
-    values = jnp.sum(jnp.where(flags, 1 << jnp.arange(BYTE_BITS), 0), axis=1).astype(jnp.uint8)
-    places = jnp.asarray(_PLACES_OF_BYTE)
+def _compact_one_by_one(mask: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.Array]:
+    """Each index is written, and the next one over it unless it counts."""
 
     def step(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         index, count = state
-        value = values[i].astype(jnp.int32)
-        new = i * BYTE_BITS + places[value].astype(jnp.int32)
-        # Beyond the capacity the start is moved back, to the room at the end.
-        index = jax.lax.dynamic_update_slice(index, new, (count,))
-        return index, count + jax.lax.population_count(value)
+        # Beyond the capacity the place is moved back, to the room at the end.
+        index = jax.lax.dynamic_update_slice(index, i.astype(jnp.int32)[None], (count,))
+        return index, count + mask[i].astype(jnp.uint32)
 
-    none = jnp.full(capacity + BYTE_BITS, size, jnp.int32)
-    init = none, jnp.int32(0)
-    index, count = jax.lax.fori_loop(0, values.shape[0], step, init)
-    # Over what the last byte wrote beyond its flags.
-    index = jax.lax.dynamic_update_slice(index, none[:BYTE_BITS], (count,))
-    return index[:capacity], count
+    size = mask.shape[0]
+    none = jnp.full(capacity + 1, size, jnp.int32)
+    index, count = _one_by_one(size, step, (none, jnp.uint32(0)))
+    # Over what the last index wrote if it does not count.
+    index = jax.lax.dynamic_update_slice(index, none[:1], (count,))
+    return index[:capacity], count.astype(jnp.int32)
 
 
 def _words(mask: jax.Array) -> jax.Array:
