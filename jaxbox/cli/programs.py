@@ -6,6 +6,7 @@ program first, in every process anew.
 
 import dataclasses
 import functools
+import gc
 import hashlib
 import pathlib
 import typing
@@ -88,7 +89,14 @@ def _trace(settings: Any, capacity: int) -> jax.export.Exported:
 
     shapes = (capacity, 4), (capacity,), (), (settings.num_leaves,)
     dtypes = np.float32, np.float32, np.int32, np.float32
-    return jax.export.export(jax.jit(run))(*map(jax.ShapeDtypeStruct, shapes, dtypes))
+    # A million objects, hardly any of them garbage: to look for it would take a tenth of the time.
+    was_collecting = gc.isenabled()
+    gc.disable()
+    try:
+        return jax.export.export(jax.jit(run))(*map(jax.ShapeDtypeStruct, shapes, dtypes))
+    finally:
+        if was_collecting:
+            gc.enable()
 
 
 def _example(cls: type) -> Any:

@@ -8,6 +8,7 @@ import numpy as np
 
 import jaxbox
 from jaxbox.cli.cache import cache_folder
+from jaxbox.cli.memory import giving_memory_back
 from jaxbox.cli.programs import Program, kept_program
 from jaxbox.config import DetectorConfig
 from jaxbox.types import Detections, PointCloud
@@ -34,9 +35,10 @@ class TimedDetector:
     def _compile(self, capacity: int) -> float:
         """Seconds of a first call on an empty sweep; a second one is taken off, as it is no compiling."""
         start = time.perf_counter()
-        self._programs[capacity] = self._program(capacity)
         empty = PointCloud.from_numpy(np.zeros((0, 3), np.float32), capacity=capacity)
-        self._run(empty)
+        self._programs[capacity] = self._program(capacity)
+        with giving_memory_back():
+            self._run(empty)
         _, again_s = self._run(empty)
         return time.perf_counter() - start - 2 * again_s
 
