@@ -149,17 +149,10 @@ def map_rows(
         return function(rows)
     function = jax.jit(function, inline=True)  # Traced once, for its shapes and for the loop.
     capacity = jax.tree.leaves(rows)[0].shape[axis]
-    missing = -capacity % chunk
-
-    def extended(a: jax.Array) -> jax.Array:
-        width = [(0, 0)] * a.ndim
-        width[axis] = (0, missing)
-        return jnp.pad(a, width)
-
-    padded = jax.tree.map(extended, rows)
+    whole = _whole_chunks(rows, chunk, axis)
 
     def part(start: jax.Array) -> Any:
-        return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, start, chunk, axis), padded)
+        return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, start, chunk, axis), whole)
 
     def step(start: jax.Array, out: Any) -> Any:
         new = function(part(start))
@@ -167,12 +160,26 @@ def map_rows(
 
     def empty(shape: jax.ShapeDtypeStruct) -> jax.Array:
         size = list(shape.shape)
-        size[axis] = capacity + missing
+        size[axis] = capacity + -capacity % chunk
         return jnp.zeros(size, shape.dtype)
 
     out = jax.tree.map(empty, jax.eval_shape(function, jax.eval_shape(part, jnp.uint32(0))))
     out = for_chunks(num_rows, chunk, step, out, capacity=capacity)
+    if capacity % chunk == 0:
+        return out
     return jax.tree.map(lambda a: jax.lax.slice_in_dim(a, 0, capacity, axis=axis), out)
+
+
+def _whole_chunks(rows: Any, chunk: int, axis: int = 0) -> Any:
+    """Rows with zeros after the last, so that they are so many whole chunks."""
+    missing = -jax.tree.leaves(rows)[0].shape[axis] % chunk
+
+    def extended(a: jax.Array) -> jax.Array:
+        width = [(0, 0)] * a.ndim
+        width[axis] = (0, missing)
+        return jnp.pad(a, width)
+
+    return jax.tree.map(extended, rows) if missing else rows
 
 
 def fold_rows(
@@ -210,12 +217,12 @@ def fold_rows(
 
     if on_accelerator():
         return fold(state, jnp.arange(size), rows)
-    padded = jax.tree.map(lambda a: jnp.pad(a, (0, -size % chunk)), rows)
+    whole = _whole_chunks(rows, chunk)
 
     def step(start: jax.Array, state: Any) -> Any:
         index = start.astype(jnp.int32) + jnp.arange(chunk)
         return fold(
-            state, index, jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, start, chunk), padded)
+            state, index, jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, start, chunk), whole)
         )
 
     return for_chunks(num_rows, chunk, step, state)
