@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxbox.capacities import GROUND_CANDIDATE_CELL_M
 from jaxbox.loops import store
-from jaxbox.masked import compact, lookup
+from jaxbox.masked import compact, count, greatest, lookup
 from jaxbox.types import GroundPlane
 
 HYPOTHESES_AT_A_TIME = 32
@@ -139,20 +139,20 @@ def fit_ground_plane(
     def is_near(plane: jax.Array) -> jax.Array:
         return mask & (jnp.abs(plane_residual(candidates, plane)) < tolerance_m)
 
-    def num(flags: jax.Array) -> jax.Array:
+    def support_of(plane: jax.Array) -> jax.Array:
         # In float32: sums of integers are several times slower (XLA, CPU).
-        return jnp.sum(flags, dtype=jnp.float32)
+        return jnp.sum(is_near(plane), dtype=jnp.float32)
 
-    index, count = compact(mask, mask.shape[0])
+    index, num = compact(mask, mask.shape[0])
     draws = _draw(key, round_index, (num_hypotheses, 3))
-    picks = index[jnp.minimum((draws * count).astype(jnp.int32), jnp.maximum(count - 1, 0))]
+    picks = index[jnp.minimum((draws * num).astype(jnp.int32), jnp.maximum(num - 1, 0))]
     planes = jax.vmap(_plane_through)(candidates[jnp.minimum(picks, mask.shape[0] - 1)])
-    support = jax.lax.map(lambda plane: num(is_near(plane)), planes, batch_size=HYPOTHESES_AT_A_TIME)
+    support = jax.lax.map(support_of, planes, batch_size=HYPOTHESES_AT_A_TIME)
     best = planes[jnp.argmax(jnp.where(_is_level(planes.T, max_grade), support, 0))]
     plane = jax.lax.fori_loop(0, num_refits, lambda _, p: _refit(candidates, is_near(p), p), best)
-    num_inliers = jnp.where(_is_level(plane, max_grade), num(is_near(plane)), 0).astype(jnp.int32)
-    found = (num_inliers >= 3) & (num_inliers >= min_inlier_fraction * count)
-    lowest = jnp.min(jnp.where(mask, candidates[:, 2], jnp.inf))
+    num_inliers = jnp.where(_is_level(plane, max_grade), count(is_near(plane)), 0)
+    found = (num_inliers >= 3) & (num_inliers >= min_inlier_fraction * num)
+    lowest = -greatest(jnp.where(mask, -candidates[:, 2], -jnp.inf), -jnp.inf)
     level = jnp.array([0.0, 0.0, 1.0]) * jnp.where(jnp.isfinite(lowest), lowest, 0)
     return GroundPlane(jnp.where(found, plane, level), found, jnp.where(found, num_inliers, 0))
 
@@ -254,10 +254,10 @@ def _is_level(plane: jax.Array, max_grade: jax.Array) -> jax.Array:
 def _refit(candidates: jax.Array, inliers: jax.Array, plane: jax.Array) -> jax.Array:
     """Least-squares plane through the inliers, about their mean: float32 sums would cancel else."""
     rows = candidates.T
-    count = jnp.maximum(jnp.sum(inliers, dtype=jnp.float32), 1)
-    mean = jnp.sum(jnp.where(inliers, rows, 0), axis=1) / count
+    num = jnp.maximum(count(inliers), 1).astype(jnp.float32)
+    mean = jnp.sum(jnp.where(inliers, rows, 0), axis=1) / num
     centred = jnp.where(inliers, rows - mean[:, None], 0)
-    cov = jnp.sum(centred[:, None] * centred, axis=-1) / count
+    cov = jnp.sum(centred[:, None] * centred, axis=-1) / num
     determinant = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
     a = (cov[0, 2] * cov[1, 1] - cov[1, 2] * cov[0, 1]) / determinant
     b = (cov[1, 2] * cov[0, 0] - cov[0, 2] * cov[0, 1]) / determinant

@@ -133,12 +133,13 @@ def convex_hulls(
     size = valid.shape[1]
     x = jnp.where(valid, x, jnp.nan)
     chain_x, chain_y, count = _lower_hulls(*store([_both_ways(x), _both_ways(y)]))
+    present = count[:size] > 0
     # A chain that ends where the other begins leaves that point to it.
     end = jnp.maximum(count - 1, 0), jnp.arange(2 * size)
     closes_x, closes_y = (chain[end] == -jnp.roll(chain[0], size) for chain in (chain_x, chain_y))
     count = count - (closes_x & closes_y & (count > 0))
     # Points all in one place close both chains.
-    num_lower = jnp.maximum(count[:size], jnp.any(valid, axis=0))
+    num_lower = jnp.maximum(count[:size], present)
     num = num_lower + count[size:]
     j = jnp.arange(max_vertices)[:, None]
     pick = jnp.where(num > max_vertices, j * num // max_vertices, jnp.maximum(jnp.minimum(j, num - 1), 0))

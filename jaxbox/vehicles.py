@@ -12,7 +12,7 @@ import numpy as np
 from jaxbox.geometry import rectangle_iou
 from jaxbox.grouping import sort_by_group
 from jaxbox.loops import for_chunks, map_rows
-from jaxbox.masked import WORD_BITS, prefix_max, prefix_sum, split_index
+from jaxbox.masked import WORD_BITS, count, prefix_max, prefix_sum, split_index
 
 NEARBY_CELL_M = 1.0
 """Points are looked up by cells of this size."""
@@ -434,7 +434,7 @@ def suppress(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | flo
 
     Reference: oracle `jaxbox.reference.suppress`.
     """
-    rivals = _overlaps(boxes, jnp.sum(valid), max_overlap)[: valid.shape[0]]
+    rivals = _overlaps(boxes, count(valid), max_overlap)[: valid.shape[0]]
 
     def without_rivals(keep: jax.Array) -> jax.Array:
         return valid & ~jnp.any((rivals & keep) != 0, axis=1)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxbox import descriptors, hull, vehicles
 from jaxbox.config import DetectorConfig
 from jaxbox.loops import at_once, fold_rows, map_rows, store
-from jaxbox.masked import compact, count_true, lookup, take
+from jaxbox.masked import compact, count_true, greatest, lookup, take
 from jaxbox.steps.boxes import Fits, max_slab_points, trace_hulls
 from jaxbox.steps.decision import Candidates
 from jaxbox.steps.points import Heights, Obstacles, Sweep
@@ -41,7 +41,7 @@ def conclude(
     valid = row < keep.shape[0]
     asked, owner, num_asked = _owners(kept, valid, obstacles, proposals)
     num_points, hulls, shapes = _describe(owner, asked, num_asked, obstacles.xy, kept, num, config)
-    largest_hull = jnp.maximum(jnp.max(hulls.num_vertices), fits.hull_vertices)
+    largest_hull = jnp.maximum(greatest(hulls.num_vertices, 0), fits.hull_vertices)
     points = _count_points(sweep, heights, proposals, config)
 
     def account() -> tuple[Counts, jax.Array]:
