@@ -28,6 +28,18 @@ def test_prefix_sum_and_prefix_max_are_those_of_numpy_on_every_platform(size):
     np.testing.assert_array_equal(greatest, np.maximum.accumulate(abs(values)))
 
 
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("size", SIZES)
+def test_count_and_greatest_are_those_of_numpy_on_every_platform(size):
+    values = np.random.default_rng(size).normal(size=size).astype(np.float32)
+    num, highest, floor = jax.jit(
+        lambda v: (masked.count(v > 0), masked.greatest(v, -jnp.inf), masked.greatest(v, 9.0))
+    )(values)
+    assert num.dtype == jnp.int32
+    assert int(num) == np.sum(values > 0)
+    assert (float(highest), float(floor)) == (values.max(), 9.0)
+
+
 def count_loops(function, *args, **options):
     """Loops of a jitted function's program for a CPU, and how many of them are native code.
 
@@ -39,7 +51,14 @@ def count_loops(function, *args, **options):
 
 
 @pytest.mark.parametrize(
-    "toolbox", [masked.prefix_sum, masked.prefix_max, lambda m: masked.compact(m > 0, 9)]
+    "toolbox",
+    [
+        masked.prefix_sum,
+        masked.prefix_max,
+        lambda m: masked.compact(m > 0, 9),
+        lambda m: masked.count(m > 0),
+        lambda m: masked.greatest(m, 0),
+    ],
 )
 def test_a_cpu_runs_the_toolbox_in_native_loops(toolbox):
     assert count_loops(jax.jit(toolbox), jnp.zeros(1000, jnp.int32)) == (1, 1)
@@ -236,7 +255,7 @@ def test_fold_points_sees_each_point_of_each_cluster_once_and_in_order(backend):
 def test_both_ways_to_compact_give_the_same(share, capacity):
     for size in (1, 31, 32, 1000):
         mask = jnp.asarray(np.random.default_rng(size).random(size) < share)
-        ways = masked._compact_by_bytes, masked._compact_at_once
+        ways = masked._compact_one_by_one, masked._compact_at_once
         one, other = (way(mask, capacity=capacity) for way in ways)
         np.testing.assert_array_equal(one[0], other[0])
         assert int(one[1]) == int(other[1]) == int(mask.sum())

@@ -1,6 +1,9 @@
 """The kept program: the bits of `detect`, read and not traced the second time, traced anew when broken."""
 
 import dataclasses
+import gc
+import pathlib
+import platform
 
 import jax
 import jax.export
@@ -12,6 +15,7 @@ from test_detector import CAPACITY, found, street
 import jaxbox
 from jaxbox import DetectorConfig, PointCloud
 from jaxbox.cli import cache, programs
+from jaxbox.cli.memory import giving_memory_back
 from jaxbox.cli.timing import TimedDetector
 
 BASE = DetectorConfig()
@@ -47,6 +51,7 @@ def traced(monkeypatch):
 def test_traced_or_read_it_has_the_bits_of_detect_and_thresholds_are_inputs(tmp_path):
     cloud = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY)
     jax.tree.map(np.testing.assert_array_equal, load(tmp_path)(cloud), found(0))
+    assert gc.isenabled()
     (path,) = (tmp_path / programs.FOLDER).iterdir()
     written = path.stat().st_mtime_ns
     strict = changed("vehicles", min_score=0.05)
@@ -106,3 +111,23 @@ def test_the_command_line_keeps_programs_in_its_own_cache_only(traced, tmp_path,
     finally:
         jax.config.update("jax_compilation_cache_dir", users)
     assert traced == [CAPACITY]
+
+
+def resident_mb():
+    status = pathlib.Path("/proc/self/status").read_text()
+    return int(status.split("VmRSS:")[1].split()[0]) / 1000
+
+
+def test_memory_that_was_freed_goes_back_to_the_system():
+    # Other C libraries give memory back by themselves.
+    glibc = platform.libc_ver()[0] == "glibc"
+    before = resident_mb() if glibc else 0
+    blocks = [np.full(8000, 1.0) for _ in range(3000)]  # 192 MB, each too small to be mapped by itself
+    held = resident_mb() if glibc else 192
+    with giving_memory_back():
+        # One that stays near the end keeps the heap from shrinking by itself.
+        blocks = blocks[-1:]
+    left = resident_mb() if glibc else 0
+    assert held - before > 150
+    assert left - before < 50
+    assert blocks[0].sum() == 8000
