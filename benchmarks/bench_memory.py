@@ -72,13 +72,16 @@ def watch_run(preset: str, frames: int) -> dict[str, Any]:
     if process.returncode:
         raise SystemExit(f"jaxbox detect ended with exit code {process.returncode}")
     done, now, peak = np.array(samples).T
-    settled = done >= SETTLED_SHARE * frames
+    # After its last frame the process gives its memory up.
+    settled = (done >= SETTLED_SHARE * frames) & (done < frames)
+    if not settled.any():
+        raise SystemExit(f"--frames {frames}: the run was over before its memory could be read; ask for more")
     slope = np.polyfit(done[settled], now[settled], 1)[0] if np.ptp(done[settled]) > 0 else 0.0
     return {
         "frames": frames,
         "peak_mb": float(peak.max()),
         "median_mb": float(np.median(now[settled])),
-        "last_mb": float(now[-1]),
+        "last_mb": float(now[settled][-1]),
         "growth_mb_per_1000_frames": float(1000 * slope),
     }
 
