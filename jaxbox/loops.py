@@ -150,6 +150,7 @@ def map_rows(
     function = jax.jit(function, inline=True)  # Traced once, for its shapes and for the loop.
     capacity = jax.tree.leaves(rows)[0].shape[axis]
     whole = _whole_chunks(rows, chunk, axis)
+    room = jax.tree.leaves(whole)[0].shape[axis]
 
     def part(start: jax.Array) -> Any:
         return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, start, chunk, axis), whole)
@@ -160,12 +161,12 @@ def map_rows(
 
     def empty(shape: jax.ShapeDtypeStruct) -> jax.Array:
         size = list(shape.shape)
-        size[axis] = capacity + -capacity % chunk
+        size[axis] = room
         return jnp.zeros(size, shape.dtype)
 
     out = jax.tree.map(empty, jax.eval_shape(function, jax.eval_shape(part, jnp.uint32(0))))
     out = for_chunks(num_rows, chunk, step, out, capacity=capacity)
-    if capacity % chunk == 0:
+    if room == capacity:
         return out
     return jax.tree.map(lambda a: jax.lax.slice_in_dim(a, 0, capacity, axis=axis), out)
 
