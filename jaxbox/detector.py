@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +11,23 @@ import numpy as np
 from jaxbox import steps
 from jaxbox.config import DetectorConfig
 from jaxbox.devices import batch_together
+from jaxbox.evidence import Evidence
 from jaxbox.loops import AT_ONCE, apart, at_once
+from jaxbox.steps.boxes import Fits
+from jaxbox.steps.points import Heights, Obstacles, Sweep
+from jaxbox.steps.proposals import Proposals
 from jaxbox.types import Detections, PointCloud
+
+
+class Segments(NamedTuple):
+    """What the first half of `detect` finds, and the second reads."""
+
+    sweep: Sweep
+    heights: Heights
+    obstacles: Obstacles
+    proposals: Proposals
+    fits: Fits
+    seen: Evidence | None
 
 
 def detect(
@@ -43,6 +58,46 @@ def detect(
     Reference: paper, section 3; oracle `jaxbox.reference.detect`.
     """
     return _detect_jit(*_operands(cloud, config, key))
+
+
+def segment(
+    cloud: PointCloud, config: DetectorConfig | None = None, key: jax.Array | None = None
+) -> Segments:
+    """The first half of `detect`, from the points to rectangles, as a compiled function of its own.
+
+    ``decide(cloud, segment(cloud, config, key), config)`` is ``detect(cloud, config, key)``, bit for bit, and
+    takes a twentieth longer. But each half can be compiled while the other is traced.
+
+    Args:
+      cloud: as `detect` takes it.
+      config: as `detect` takes it.
+      key: as `detect` takes it.
+
+    Returns:
+      What `decide` reads.
+
+    Raises:
+      ValueError: for settings that contradict each other.
+    """
+    return _segment_jit(*_operands(cloud, config, key))
+
+
+def decide(cloud: PointCloud, segments: Segments, config: DetectorConfig | None = None) -> Detections:
+    """The second half of `detect`: completed boxes, their scores, and which of them are vehicles.
+
+    Args:
+      cloud: that `segments` are of.
+      segments: from `segment`, with the same settings.
+      config: as `detect` takes it.
+
+    Returns:
+      The detections, as `detect` gives them.
+
+    Raises:
+      ValueError: for settings that contradict each other.
+    """
+    cloud, settings, _ = _operands(cloud, config, None)
+    return _decide_jit(cloud, segments, settings)
 
 
 def lower(
@@ -112,13 +167,12 @@ class _Settings:
         return jax.tree.unflatten(self.structure, thresholds)
 
 
-def _find_vehicles(cloud: PointCloud, settings: _Settings, key: jax.Array) -> Detections:
-    config = settings.unpack()
+# What a step finds is stored, or the compiler would work it out again in each later step that reads it,
+# and its scratch memory is freed: beyond 32 MB, glibc would return it to the system at each call, and
+# a sixth of the time would go into getting it back page by page.
 
-    # What a step finds is stored, or the compiler would work it out again in each later step that reads it,
-    # and its scratch memory is freed: beyond 32 MB, glibc would return it to the system at each call, and
-    # a sixth of the time would go into getting it back page by page.
 
+def _segment(cloud: PointCloud, config: DetectorConfig, key: jax.Array) -> Segments:
     # 3.1 Statistical filtering, and ground removal by RANSAC (Algorithm I).
     sweep = apart(steps.select_points, cloud, config)
     heights = apart(steps.remove_ground, sweep, config, key)
@@ -127,17 +181,38 @@ def _find_vehicles(cloud: PointCloud, settings: _Settings, key: jax.Array) -> De
     proposals = apart(steps.propose_clusters, obstacles, config)
     # 3.3, 3.4 Convex hull and minimum rectangle over all rotations (Algorithm III).
     fits = apart(steps.fit_rectangles, obstacles, proposals, config)
-    # Correction for occluded objects: what the beams saw decides how each box goes on out of sight.
+    # What the beams saw, for the correction.
     seen = apart(steps.build_evidence, sweep, heights, config)
+    return Segments(sweep, heights, obstacles, proposals, fits, seen)
+
+
+def _decide(cloud: PointCloud, segments: Segments, config: DetectorConfig) -> Detections:
+    sweep, heights, obstacles, proposals, fits, seen = segments
+    # Correction for occluded objects: what the beams saw decides how each box goes on out of sight.
     trials, boxes = apart(steps.complete_boxes, fits, proposals, seen, config)
     # Vehicle decision: score, suppression, and (3.5) the descriptors of what is left.
     candidates = apart(steps.score_boxes, trials, boxes, proposals, obstacles, heights, seen, config)
     return apart(steps.conclude, cloud, sweep, heights, obstacles, proposals, fits, candidates, config)
 
 
+def _find_vehicles(cloud: PointCloud, settings: _Settings, key: jax.Array) -> Detections:
+    config = settings.unpack()
+    return _decide(cloud, _segment(cloud, config, key), config)
+
+
 _one_after_the_other = jax.custom_batching.sequential_vmap(_find_vehicles)
 _find = jax.custom_batching.custom_vmap(_find_vehicles)
 _detect_jit = jax.jit(_find)
+
+
+@jax.jit
+def _segment_jit(cloud: PointCloud, settings: _Settings, key: jax.Array) -> Segments:
+    return _segment(cloud, settings.unpack(), key)
+
+
+@jax.jit
+def _decide_jit(cloud: PointCloud, segments: Segments, settings: _Settings) -> Detections:
+    return _decide(cloud, segments, settings.unpack())
 
 
 @_find.def_vmap

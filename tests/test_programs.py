@@ -16,6 +16,7 @@ import jaxbox
 from jaxbox import DetectorConfig, PointCloud
 from jaxbox.cli import cache, programs
 from jaxbox.cli.memory import giving_memory_back
+from jaxbox.cli.programs import Half
 from jaxbox.cli.timing import TimedDetector
 
 BASE = DetectorConfig()
@@ -27,8 +28,12 @@ def changed(room, **values):
 
 def load(folder, config=BASE, *, capacity=CAPACITY):
     """The program, as a new process gets it."""
-    programs._load_or_trace.cache_clear()
+    programs._compile_halves.cache_clear()
     return programs.kept_program(config, capacity=capacity, folder=folder)
+
+
+def halves(*capacities):
+    return [(half, capacity) for capacity in capacities for half in Half]
 
 
 @pytest.fixture
@@ -36,13 +41,14 @@ def traced(monkeypatch):
     """A quick stand-in for the detector's trace, and what it was asked for."""
     asked = []
 
-    def trace(settings, capacity):
-        asked.append(capacity)
+    def trace(half, settings, capacity):
+        asked.append((half, capacity))
         shapes = (capacity, 4), (capacity,), (), (settings.num_leaves,)
         dtypes = np.float32, np.float32, np.int32, np.float32
         operands = map(jax.ShapeDtypeStruct, shapes, dtypes)
         num_outputs = jax.tree.structure(programs._example(jaxbox.Detections)).num_leaves
-        return jax.export.export(jax.jit(lambda *_: [jnp.zeros(())] * num_outputs))(*operands)
+        outputs = {Half.SEGMENT: 0, Half.DECIDE: num_outputs}[half]
+        return jax.export.export(jax.jit(lambda *_: [jnp.zeros(())] * outputs))(*operands)
 
     monkeypatch.setattr(programs, "_trace", trace)
     return asked
@@ -52,43 +58,51 @@ def test_traced_or_read_it_has_the_bits_of_detect_and_thresholds_are_inputs(tmp_
     cloud = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY)
     jax.tree.map(np.testing.assert_array_equal, load(tmp_path)(cloud), found(0))
     assert gc.isenabled()
-    (path,) = (tmp_path / programs.FOLDER).iterdir()
-    written = path.stat().st_mtime_ns
+    paths = sorted((tmp_path / programs.FOLDER).iterdir())
+    written = [path.stat().st_mtime_ns for path in paths]
     strict = changed("vehicles", min_score=0.05)
     answer = load(tmp_path, strict)(cloud)
-    assert path.stat().st_mtime_ns == written
+    assert [path.stat().st_mtime_ns for path in paths] == written
+    assert paths == sorted((tmp_path / programs.FOLDER).iterdir())
     jax.tree.map(np.testing.assert_array_equal, answer, jaxbox.detect(cloud, strict))
     assert 0 < answer.valid.sum() < found(0).valid.sum()
+
+
+def test_without_evidence_it_has_the_bits_of_detect(tmp_path):
+    cloud = PointCloud.from_numpy(street(1).xyz, capacity=CAPACITY)
+    paper = DetectorConfig.paper()
+    jax.tree.map(np.testing.assert_array_equal, load(tmp_path, paper)(cloud), jaxbox.detect(cloud, paper))
 
 
 def test_it_is_traced_once_for_its_static_settings_and_capacity(traced, tmp_path):
     load(tmp_path)
     load(tmp_path)
     load(tmp_path, changed("clustering", min_points=3.0))
-    assert traced == [CAPACITY]
+    assert traced == halves(CAPACITY)
     load(tmp_path, capacity=2 * CAPACITY)
     load(tmp_path, changed("vehicles", max_detections=16))
-    assert traced == [CAPACITY, 2 * CAPACITY, CAPACITY]
+    assert traced == halves(CAPACITY, 2 * CAPACITY, CAPACITY)
     with jax.default_matmul_precision("highest"):
         load(tmp_path)
-    assert len(traced) == len(list((tmp_path / programs.FOLDER).iterdir())) == 4
+    assert len(traced) == len(list((tmp_path / programs.FOLDER).iterdir())) == 8
 
 
-def test_a_broken_file_is_traced_anew(traced, tmp_path):
+@pytest.mark.parametrize("half", Half)
+def test_a_broken_file_is_traced_anew(traced, tmp_path, half):
     load(tmp_path)
-    (path,) = (tmp_path / programs.FOLDER).iterdir()
+    (path,) = (tmp_path / programs.FOLDER).glob(f"*.{half}.*")
     whole = path.read_bytes()
     for broken in (b"", whole[: len(whole) // 2], b"\xff" * 64):
         path.write_bytes(broken)
         load(tmp_path)
         load(tmp_path)
-    assert len(traced) == 4
+    assert traced == halves(CAPACITY) + 3 * [(half, CAPACITY)]
 
 
 def test_a_folder_that_cannot_be_made_does_not_matter(traced, tmp_path):
     (tmp_path / "file").touch()
     load(tmp_path / "file")
-    assert traced == [CAPACITY]
+    assert traced == halves(CAPACITY)
 
 
 def test_settings_that_contradict_each_other_are_refused_though_a_program_is_kept(traced, tmp_path):
@@ -106,11 +120,11 @@ def test_the_command_line_keeps_programs_in_its_own_cache_only(traced, tmp_path,
     assert not traced
     try:
         jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-        programs._load_or_trace.cache_clear()
+        programs._compile_halves.cache_clear()
         TimedDetector(BASE)(cloud)
     finally:
         jax.config.update("jax_compilation_cache_dir", users)
-    assert traced == [CAPACITY]
+    assert traced == halves(CAPACITY)
 
 
 def resident_mb():

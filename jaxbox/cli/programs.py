@@ -4,13 +4,16 @@ JAX's compilation cache keeps what the compiler makes of a program, but to find 
 program first, in every process anew.
 """
 
+import contextlib
 import dataclasses
+import enum
 import functools
 import gc
 import hashlib
 import pathlib
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent import futures
 from typing import Any
 
 import jax
@@ -19,7 +22,7 @@ import jaxlib.version
 import numpy as np
 
 import jaxbox
-from jaxbox import io
+from jaxbox import detector, io
 from jaxbox.config import DetectorConfig
 from jaxbox.steps import check_settings
 from jaxbox.types import Detections, PointCloud
@@ -39,8 +42,15 @@ TRACED_WITH = (
 Program = Callable[[PointCloud], Detections]
 
 
+class Half(enum.StrEnum):
+    """Of `detect`, see `jaxbox.detector`: one is compiled while the other is traced."""
+
+    SEGMENT = "segment"
+    DECIDE = "decide"
+
+
 def kept_program(config: DetectorConfig, *, capacity: int, folder: pathlib.Path) -> Program:
-    """The detector for one capacity, from the folder, or traced and left there for the next run.
+    """The compiled detector for one capacity, from the folder, or traced and left there for the next run.
 
     What is kept is StableHLO with the thresholds as an input. Its name tells the code of jaxbox, the
     versions, the device and the static settings that it was made of: another of them makes another.
@@ -60,43 +70,67 @@ def kept_program(config: DetectorConfig, *, capacity: int, folder: pathlib.Path)
     values, settings = jax.tree.flatten(config)
     thresholds = np.array(values, np.float32)
     answer = jax.tree.structure(_example(Detections))
-    run = _load_or_trace(settings, capacity, folder / FOLDER, answer.num_leaves)
+    segment, decide = _compile_halves(settings, capacity, folder / FOLDER)
 
     def program(cloud: PointCloud) -> Detections:
-        return jax.tree.unflatten(answer, run(cloud.xyz1, cloud.intensity, cloud.num_points, thresholds))
+        operands = cloud.xyz1, cloud.intensity, cloud.num_points, thresholds
+        return jax.tree.unflatten(answer, decide(*operands, *segment(*operands)))
 
     return program
 
 
 @functools.cache  # a process compiles it once, as JAX does of the function itself
-def _load_or_trace(
-    settings: Any, capacity: int, folder: pathlib.Path, num_outputs: int
-) -> Callable[..., Any]:
-    path = folder / f"{_fingerprint(settings, capacity)}.stablehlo"
-    exported = _read(path, num_outputs=num_outputs)
-    if exported is None:
-        exported = _trace(settings, capacity)
-        _write(path, exported)
-    return jax.jit(exported.call)
+def _compile_halves(settings: Any, capacity: int, folder: pathlib.Path) -> list[Callable[..., Any]]:
+    name = _fingerprint(settings, capacity)
+    with _without_garbage_collection(), futures.ThreadPoolExecutor(len(Half)) as threads:
+        compiled = []
+        for half in Half:
+            path = folder / f"{name}.{half}.stablehlo"
+            kept = _read(path)
+            exported = kept or _trace(half, settings, capacity)
+            # Here and not by the thread, which the tracing of the next half would keep from Python's lock.
+            lowered = jax.jit(exported.call).lower(*exported.in_avals)
+            compiled.append(threads.submit(lowered.compile))
+            if kept is None:
+                _write(path, exported)
+        return [future.result() for future in compiled]
 
 
-def _trace(settings: Any, capacity: int) -> jax.export.Exported:
-    def run(
-        xyz1: jax.Array, intensity: jax.Array, num_points: jax.Array, thresholds: jax.Array
-    ) -> list[jax.Array]:
-        config = jax.tree.unflatten(settings, list(thresholds))
-        return jax.tree.leaves(jaxbox.detect(PointCloud(xyz1, intensity, num_points), config))
-
-    shapes = (capacity, 4), (capacity,), (), (settings.num_leaves,)
-    dtypes = np.float32, np.float32, np.int32, np.float32
-    # A million objects, hardly any of them garbage: to look for it would take a tenth of the time.
+@contextlib.contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """Tracing makes a million objects, hardly any of them garbage, and looking for it takes a tenth of it."""
     was_collecting = gc.isenabled()
     gc.disable()
     try:
-        return jax.export.export(jax.jit(run))(*map(jax.ShapeDtypeStruct, shapes, dtypes))
+        yield
     finally:
         if was_collecting:
             gc.enable()
+
+
+def _trace(half: Half, settings: Any, capacity: int) -> jax.export.Exported:
+    def inputs(
+        xyz1: jax.Array, intensity: jax.Array, num_points: jax.Array, thresholds: jax.Array
+    ) -> tuple[PointCloud, DetectorConfig]:
+        config: DetectorConfig = jax.tree.unflatten(settings, list(thresholds))
+        return PointCloud(xyz1, intensity, num_points), config
+
+    def segment(*operands: jax.Array) -> detector.Segments:
+        return detector.segment(*inputs(*operands))
+
+    shapes = (capacity, 4), (capacity,), (), (settings.num_leaves,)
+    dtypes = np.float32, np.float32, np.int32, np.float32
+    operands = list(map(jax.ShapeDtypeStruct, shapes, dtypes))
+    if half is Half.SEGMENT:
+        return jax.export.export(jax.jit(lambda *operands: jax.tree.leaves(segment(*operands))))(*operands)
+    found, structure = jax.tree.flatten(jax.eval_shape(segment, *operands))
+
+    def decide(*values: jax.Array) -> list[jax.Array]:
+        cloud, config = inputs(*values[: len(operands)])
+        segments = jax.tree.unflatten(structure, values[len(operands) :])
+        return jax.tree.leaves(detector.decide(cloud, segments, config))
+
+    return jax.export.export(jax.jit(decide))(*operands, *found)
 
 
 def _example(cls: type) -> Any:
@@ -131,14 +165,13 @@ def _source_digest() -> str:
     return digest.hexdigest()
 
 
-def _read(path: pathlib.Path, *, num_outputs: int) -> jax.export.Exported | None:
+def _read(path: pathlib.Path) -> jax.export.Exported | None:
     """What was kept, or None where nothing was, or it is broken."""
     try:
-        exported = jax.export.deserialize(bytearray(path.read_bytes()))
+        return jax.export.deserialize(bytearray(path.read_bytes()))
     except Exception:
         # Whatever is wrong with a kept file, tracing replaces it.
         return None
-    return exported if len(exported.out_avals) == num_outputs else None
 
 
 def _write(path: pathlib.Path, exported: jax.export.Exported) -> None:

@@ -36,8 +36,8 @@ class TimedDetector:
         """Seconds of a first call on an empty sweep; a second one is taken off, as it is no compiling."""
         start = time.perf_counter()
         empty = PointCloud.from_numpy(np.zeros((0, 3), np.float32), capacity=capacity)
-        self._programs[capacity] = self._program(capacity)
         with giving_memory_back():
+            self._programs[capacity] = self._program(capacity)
             self._run(empty)
         _, again_s = self._run(empty)
         return time.perf_counter() - start - 2 * again_s
