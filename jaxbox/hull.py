@@ -9,6 +9,9 @@ from jaxbox.masked import WORD_BITS, lookup, take
 MIN_EXTENT_M = 1e-6
 """Clusters narrower than this are cut as if they were so wide: all their points are in one slice."""
 
+CHUNK_POINTS = 4096
+"""Points put into slices at a time on a CPU: both cores share so large a chunk."""
+
 
 def find_bounds(
     slot: jax.Array, row: jax.Array, num_rows: jax.Array, xy: jax.Array, *, num_clusters: int
@@ -48,7 +51,6 @@ def extreme_points(
     high: jax.Array,
     *,
     num_slices: int,
-    chunk: int = 1,
 ) -> jax.Array:
     """The points of each cluster that can reach its hull: the extremes of thin slices.
 
@@ -65,8 +67,6 @@ def extreme_points(
       low: (K, 2) float32, m, least x and y of each cluster.
       high: (K, 2) float32, m, greatest x and y.
       num_slices: static, S.
-      chunk: static, points at a time on a CPU: of many points thousands take half as long as one by one,
-        which is less to compile.
 
     Returns:
       (4 S, K) int32: rows of points, some of them twice; N where a slice is empty.
@@ -101,7 +101,7 @@ def extreme_points(
 
     none = [jnp.zeros(num_slices * num_clusters, jnp.uint32)] * 4
     absent = num_clusters, xy.shape[0]
-    best = fold_rows(keep_extremes, none, (slot, row), num_rows=num_rows, chunk=chunk, absent=absent)
+    best = fold_rows(keep_extremes, none, (slot, row), num_rows=num_rows, chunk=CHUNK_POINTS, absent=absent)
     best = jnp.concatenate(best).reshape(-1, num_clusters)
     index = (best & (2**index_bits - 1)).astype(jnp.int32)
     return jnp.where(index > 0, take(row, jnp.maximum(index - 1, 0)), xy.shape[0])

@@ -68,7 +68,7 @@ def _scan_one_by_one(combine: Callable[..., jax.Array], values: jax.Array) -> ja
 
 def _one_by_one(size: int, step: Callable[[jax.Array, Any], Any], state: Any) -> Any:
     """Calls a step with each index, () uint32, and the state: XLA compiles so small a loop to native code."""
-    unroll = next(num for num in UNROLL if size % num == 0)
+    unroll = _unroll(size)
 
     def steps(start: jax.Array, state: Any) -> Any:
         for k in range(unroll):
@@ -76,6 +76,10 @@ def _one_by_one(size: int, step: Callable[[jax.Array, Any], Any], state: Any) ->
         return state
 
     return for_chunks(jnp.uint32(size), unroll, steps, state)
+
+
+def _unroll(size: int) -> int:
+    return next(num for num in UNROLL if size % num == 0)
 
 
 def count(mask: jax.Array) -> jax.Array:
@@ -140,48 +144,57 @@ def _count_before(mask: jax.Array) -> jax.Array:
     return (before[:, None] + inside).reshape(-1)[:size]
 
 
-def compact(mask: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
+def compact(mask: jax.Array, capacity: int, *, num: jax.Array | None = None) -> tuple[jax.Array, jax.Array]:
     """Indices of the True entries, in order, at a fixed capacity.
 
     Args:
-      mask: (N,) bool.
+      mask: (N,) bool, or (M, N), whose rows are gone through one after the other.
       capacity: static; entries beyond it are left out.
+      num: () int32: no entry of a row is True beyond the first so many, of which there may be more than N.
+        A CPU does not look at them.
 
     Returns:
-      index: (capacity,) int32, ascending; N where there is no entry.
+      index: (capacity,) int32, ascending, into all M N entries; M N where there is no entry.
       count: () int32, the true number of entries, which may exceed the capacity.
 
     >>> compact(jnp.array([False, True, True]), 4)[0].tolist()
     [1, 2, 3, 3]
     """
     return jax.lax.platform_dependent(
-        mask,
+        jnp.atleast_2d(mask),
+        jnp.int32(mask.shape[-1]) if num is None else num,
         cpu=functools.partial(_compact_one_by_one, capacity=capacity),
         default=functools.partial(_compact_at_once, capacity=capacity),
     )
 
 
-def _compact_at_once(mask: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.Array]:
-    size = mask.shape[0]
+def _compact_at_once(mask: jax.Array, _num: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.Array]:
+    mask = mask.reshape(-1)
     order = prefix_sum(mask)
     target = jnp.where(mask, order - 1, capacity)
-    index = jnp.full(capacity, size, jnp.int32)
-    index = index.at[target].set(jnp.arange(size, dtype=jnp.int32), mode="drop")
+    index = jnp.full(capacity, mask.size, jnp.int32)
+    index = index.at[target].set(jnp.arange(mask.size, dtype=jnp.int32), mode="drop")
     return index, order[-1]
 
 
-def _compact_one_by_one(mask: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.Array]:
+def _compact_one_by_one(mask: jax.Array, num: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.Array]:
     """Each index is written, and the next one over it unless it counts."""
+    rows, size = mask.shape
+    flags, unroll = mask.reshape(-1), _unroll(size)
+    in_use = jnp.uint32((jnp.minimum(num, size) + unroll - 1) // unroll * unroll)
 
-    def step(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def steps(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        rows_before = sum((start >= row * in_use).astype(jnp.uint32) for row in range(1, rows))
+        first = start + rows_before * (size - in_use)
         index, count = state
-        # Beyond the capacity the place is moved back, to the room at the end.
-        index = jax.lax.dynamic_update_slice(index, i.astype(jnp.int32)[None], (count,))
-        return index, count + mask[i].astype(jnp.uint32)
+        for k in range(unroll):
+            # Beyond the capacity the place is moved back, to the room at the end.
+            index = jax.lax.dynamic_update_slice(index, (first + k).astype(jnp.int32)[None], (count,))
+            count = count + flags[first + k].astype(jnp.uint32)
+        return index, count
 
-    size = mask.shape[0]
-    none = jnp.full(capacity + 1, size, jnp.int32)
-    index, count = _one_by_one(size, step, (none, jnp.uint32(0)))
+    none = jnp.full(capacity + 1, mask.size, jnp.int32)
+    index, count = for_chunks(rows * in_use, unroll, steps, (none, jnp.uint32(0)))
     # Over what the last index wrote if it does not count.
     index = jax.lax.dynamic_update_slice(index, none[:1], (count,))
     return index[:capacity], count.astype(jnp.int32)

@@ -56,6 +56,7 @@ def count_loops(function, *args, **options):
         masked.prefix_sum,
         masked.prefix_max,
         lambda m: masked.compact(m > 0, 9),
+        lambda m: masked.compact(m.reshape(4, -1) > 0, 9, num=m[0]),
         lambda m: masked.count(m > 0),
         lambda m: masked.greatest(m, 0),
     ],
@@ -90,6 +91,19 @@ def test_compact_keeps_the_first_entries_and_reports_the_true_count(capacity):
     index, count = compact(jnp.asarray(mask), capacity)
     assert int(count) == mask.sum() > capacity
     np.testing.assert_array_equal(index, np.flatnonzero(mask)[:capacity])
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("size", [1, 6, 7, 40])
+def test_compact_goes_through_rows_as_far_as_they_count_on_every_platform(size):
+    compact = jax.jit(lambda mask, num: masked.compact(mask, 3 * size + 1, num=num))
+    for num in sorted({0, 1, size - 1, size, size + 5}):
+        mask = np.random.default_rng(num).random((3, size)) < 0.6
+        mask[:, num:] = False
+        index, count = compact(mask, num)
+        expected = np.flatnonzero(mask)
+        assert int(count) == len(expected)
+        np.testing.assert_array_equal(index, np.append(expected, [mask.size] * (len(index) - len(expected))))
 
 
 def test_take_reads_rows_and_fills_those_that_are_absent():
@@ -256,7 +270,7 @@ def test_both_ways_to_compact_give_the_same(share, capacity):
     for size in (1, 31, 32, 1000):
         mask = jnp.asarray(np.random.default_rng(size).random(size) < share)
         ways = masked._compact_one_by_one, masked._compact_at_once
-        one, other = (way(mask, capacity=capacity) for way in ways)
+        one, other = (way(mask[None], jnp.int32(size), capacity=capacity) for way in ways)
         np.testing.assert_array_equal(one[0], other[0])
         assert int(one[1]) == int(other[1]) == int(mask.sum())
 

@@ -1,7 +1,6 @@
 """Parity with the reference and OpenCV: hulls, rectangles, the scene's direction, descriptors."""
 
 import dataclasses
-import functools
 import math
 import types
 
@@ -25,13 +24,14 @@ MAX_FITS = 4096
 """Rows for the clusters of all cases of a kind."""
 
 
-POINT_CHUNK = 4096
+@jax.jit
+def find_bounds(*rows):
+    return hull.find_bounds(*rows, num_clusters=parity.MAX_CLUSTERS)
 
 
-@functools.partial(jax.jit, static_argnames="chunk")
-def extreme_points(*rows, chunk=1):
-    bounds = hull.find_bounds(*rows, num_clusters=parity.MAX_CLUSTERS)
-    return hull.extreme_points(*rows, *bounds, num_slices=NUM_SLICES, chunk=chunk)
+@jax.jit
+def extreme_points(*rows):
+    return hull.extreme_points(*rows, *find_bounds(*rows), num_slices=NUM_SLICES)
 
 
 def trace_hulls(points, valid):
@@ -174,18 +174,17 @@ def test_extreme_points_lose_at_most_a_slice_of_the_hull(cases):
 
 def test_what_a_list_holds_beyond_its_end_joins_no_cluster():
     rng = np.random.default_rng(0)
-    size, num = POINT_CHUNK + 900, POINT_CHUNK + 300
+    size, num = hull.CHUNK_POINTS + 900, hull.CHUNK_POINTS + 300
     xy = jnp.asarray(rng.normal(size=(size, 2)), jnp.float32)
     slot = jnp.asarray(rng.integers(0, parity.MAX_CLUSTERS, size))
     row, origin = jnp.arange(size), jnp.zeros((parity.MAX_CLUSTERS, 2))
-    whole = 2 * POINT_CHUNK - num
+    whole = 2 * hull.CHUNK_POINTS - num
     listed = (
         jnp.pad(slot[:num], (0, whole), constant_values=parity.MAX_CLUSTERS),
         jnp.pad(row[:num], (0, whole)),
     )
     expected = extreme_points(*listed, num, xy)
-    for chunk in (1, POINT_CHUNK):
-        np.testing.assert_array_equal(extreme_points(slot, row, num, xy, chunk=chunk), expected)
+    np.testing.assert_array_equal(extreme_points(slot, row, num, xy), expected)
     expected = point_moments(*listed, num, xy, origin)
     np.testing.assert_array_equal(point_moments(slot, row, num, xy, origin), expected)
     assert expected[:, 0].sum() == num
@@ -193,7 +192,7 @@ def test_what_a_list_holds_beyond_its_end_joins_no_cluster():
 
 def test_a_cpu_describes_clusters_in_native_loops():
     rows = jnp.zeros(900, jnp.int32), jnp.zeros(900, jnp.int32), jnp.int32(9), jnp.zeros((1000, 2))
-    assert count_loops(extreme_points, *rows) == (2, 2)
+    assert count_loops(find_bounds, *rows) == (1, 1)
     assert count_loops(point_moments, *rows, jnp.zeros((parity.MAX_CLUSTERS, 2))) == (1, 1)
 
 
@@ -338,7 +337,8 @@ def test_a_hull_beyond_its_capacity_is_fitted_to_by_its_own_vertices():
     angle = np.arange(40) * (2 * np.pi / 40)
     disc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     away = np.array([10, 0])
-    obstacles = types.SimpleNamespace(xy=jnp.float32(np.concatenate([disc + away, disc - away])))
+    xy = jnp.float32(np.concatenate([disc + away, disc - away]))
+    obstacles = types.SimpleNamespace(xy=xy, count=jnp.int32(len(xy)))
     proposals = types.SimpleNamespace(
         cluster=jnp.repeat(jnp.arange(2), 40)[None],
         num_points=jnp.array([40, 40]),

@@ -156,7 +156,7 @@ def _owners(
     # No point is inside the box of no detection.
     frame = jnp.pad(kept.frame, ((0, 1), (0, 0)), constant_values=-1)
     best = functools.reduce(jnp.minimum, [lookup(of_cluster, cluster) for cluster in proposals.cluster])
-    asked, num_asked = compact(store(best < num_detections), best.shape[0])
+    asked, num_asked = compact(store(best < num_detections), best.shape[0], num=obstacles.count)
 
     def own(index: jax.Array) -> jax.Array:
         xy = take(obstacles.xy, index)

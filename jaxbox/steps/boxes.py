@@ -30,9 +30,6 @@ RAY_CHUNK = 128
 HULL_CHUNK = 32
 """Clusters whose hulls are traced at a time."""
 
-HULL_POINTS = 4096
-"""Points that are looked through for hulls at a time."""
-
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -81,11 +78,10 @@ def _hull_points(
 ) -> tuple[box.PointLists, jax.Array]:
     """The hull of each cluster, as the points that its rectangle is fitted to (the paper)."""
     num_clusters = proposals.num_points.shape[0]
-    cluster, row, num = _list_points(proposals, proposals.cluster < num_clusters, proposals.cluster.size)
+    listed, capacity = proposals.cluster < num_clusters, proposals.cluster.size
+    cluster, row, num = _list_points(obstacles, proposals, listed, capacity)
     bounds = proposals.low[:, :2], proposals.high[:, :2]
-    index = hull.extreme_points(
-        cluster, row, num, obstacles.xy, *bounds, num_slices=config.hull.num_slices, chunk=HULL_POINTS
-    )
+    index = hull.extreme_points(cluster, row, num, obstacles.xy, *bounds, num_slices=config.hull.num_slices)
     x, y, count = trace_hulls(obstacles.xy, index, proposals.num_clusters, config)
     capacity = x.shape[0]
     start, listed = jnp.arange(num_clusters) * capacity, jnp.minimum(count, capacity)
@@ -112,7 +108,7 @@ def _slab_points(
     """The points of each cluster between the slab's heights, or all where those are few."""
     num_maps = proposals.cluster.shape[0]
     capacity = num_maps * max_slab_points(obstacles.num_rows, config)
-    cluster, row, num = _list_points(proposals, proposals.fitted, capacity)
+    cluster, row, num = _list_points(obstacles, proposals, proposals.fitted, capacity)
     lists = box.list_points(
         cluster,
         row,
@@ -125,7 +121,7 @@ def _slab_points(
 
 
 def _list_points(
-    proposals: Proposals, listed: jax.Array, capacity: int
+    obstacles: Obstacles, proposals: Proposals, listed: jax.Array, capacity: int
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The points (maps, O) of all maps that are to be listed, in one list without gaps.
 
@@ -135,7 +131,7 @@ def _list_points(
       num: () int32; only the first so many count.
     """
     num_maps, num_obstacles = proposals.cluster.shape
-    entry, num = compact(listed.reshape(-1), capacity)
+    entry, num = compact(listed, capacity, num=obstacles.count)
     # The remainder by the number of obstacles, without the division.
     row = entry - num_obstacles * sum(entry >= num_obstacles * i for i in range(1, num_maps))
     return jnp.take(proposals.cluster.reshape(-1), entry, mode="clip"), row, num
