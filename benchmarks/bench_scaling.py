@@ -246,7 +246,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sizes = time_sizes(
         points, QUICK_CAPACITIES if quick else CAPACITY_BUCKETS, config, QUICK_RUNS if quick else RUNS
     )
-    batches = time_batches([PointCloud.from_numpy(xyz) for xyz in points], config, quick=quick)
+    clouds = [jax.device_put(PointCloud.from_numpy(xyz)) for xyz in points]
+    batches = time_batches(clouds, config, quick=quick)
 
     columns = ("points", "median", "p90", "ns_per_point", "first_call_s")
     header = ["points", "median ms", "p90 ms", "ns a point", "first call s", "status"]

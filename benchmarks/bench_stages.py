@@ -51,7 +51,7 @@ def time_whole(
     points: Sequence[tuple[np.ndarray, np.ndarray]], config: DetectorConfig, passes: int
 ) -> dict[str, Any]:
     """Whole sweeps through detect(): from the host to the host, and on the device."""
-    clouds = [PointCloud.from_numpy(*p) for p in points]
+    clouds = [jax.device_put(PointCloud.from_numpy(*p)) for p in points]
     first_call_ms, _ = common.milliseconds(lambda: jaxbox.detect(clouds[0], config))
     on_host, on_device, statuses = [], [], []
 

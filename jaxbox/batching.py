@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import jax
+import numpy as np
 
 from jaxbox.config import DetectorConfig
 from jaxbox.detector import detect
@@ -78,6 +79,14 @@ def detect_on(
       The detections, which may still be computing.
     """
     # An array that was put on a device is tied to it, and JAX compiles anew for it even where it already was.
-    if device not in cloud.xyz1.devices():
+    if device not in _devices_of(cloud.xyz1):
         cloud, key = jax.device_put((cloud, key), device)
     return detect(cloud, config, key)
+
+
+def _devices_of(array: jax.Array | np.ndarray) -> set[Any]:
+    """Where JAX computes with an array: with NumPy's on its default device."""
+    if isinstance(array, jax.Array):
+        return array.devices()
+    default = jax.config.values["jax_default_device"]  # a device, the name of a platform, or None
+    return {default if isinstance(default, jax.Device) else jax.local_devices(backend=default)[0]}

@@ -109,9 +109,8 @@ class _Buffer:
         if len(self._rows) != capacity:
             self._rows, self._intensity = aligned_empty((capacity, 4)), aligned_empty((capacity,))
         fill_rows(xyz, intensity, self._rows, self._intensity)
-        # On a CPU the cloud's arrays are the buffer: who fills it again has waited for the result.
-        arrays = self._rows, self._intensity, np.int32(len(xyz))
-        return PointCloud(*jax.device_put(arrays, may_alias=True))
+        # On a CPU JAX computes with the buffer itself: who fills it again has waited for the result.
+        return PointCloud(self._rows, self._intensity, np.array(len(xyz), np.int32))
 
 
 def _read(sweep: ReadableSweep, buffer: _Buffer, capacity: int | None) -> PointCloud | str:

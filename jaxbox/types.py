@@ -94,11 +94,11 @@ class Label(enum.IntEnum):
 class PointCloud:
     """One sweep, padded to a capacity N. Build it with `from_numpy`."""
 
-    xyz1: jax.Array
+    xyz1: jax.Array | np.ndarray
     """(N, 4) float32, m, sensor frame: x, y, z and 1 for a point, all 0 for padding."""
-    intensity: jax.Array
+    intensity: jax.Array | np.ndarray
     """(N,) float32, the sensor's own unit; 0 where unknown and for padding."""
-    num_points: jax.Array
+    num_points: jax.Array | np.ndarray
     """() int32: points in the source sweep, which may exceed N (see `Status.POINT_OVERFLOW`)."""
 
     @property
@@ -120,7 +120,8 @@ class PointCloud:
             largest bucket. Where n is larger than N the N nearest points are kept, in their order.
 
         Returns:
-          A cloud whose `num_points` is n, also where points were dropped.
+          A cloud of NumPy arrays, whose `num_points` is n, also where points were dropped. A CPU uses them
+          as they are; for several calls on an accelerator, hand them over once: ``jax.device_put(cloud)``.
 
         Raises:
           ValueError: for another shape, a non-numeric type or a capacity below 1.
@@ -134,8 +135,9 @@ class PointCloud:
             raise ValueError(f"capacity is {capacity}; it must be at least 1.")
         rows, padded = aligned_empty((capacity, 4)), aligned_empty((capacity,))
         fill_rows(xyz, intensity, rows, padded)
-        # Nobody else holds these arrays, so JAX may use them as they are.
-        return cls(*jax.device_put((rows, padded, np.int32(len(xyz)))))
+        # JAX uses them as they are, so nobody is to write to them any more.
+        rows.flags.writeable = padded.flags.writeable = False
+        return cls(rows, padded, np.array(len(xyz), np.int32))
 
 
 def stack_clouds(clouds: Sequence[PointCloud]) -> PointCloud:

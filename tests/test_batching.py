@@ -69,9 +69,18 @@ def test_devices_take_turns_and_each_gets_the_cloud_and_the_key(monkeypatch):
     clouds, config = [cloud(seed) for seed in SEEDS], DetectorConfig()
     calls = detect_batch(clouds, config, jax.random.key(5))
     for number, (sent, settings, key) in enumerate(calls):
-        assert sent.xyz1.devices() == key.devices() == {jax.local_devices()[number % 2]}
+        device = jax.local_devices()[number % 2]
+        assert batching._devices_of(sent.xyz1) == key.devices() == {device}
         assert settings is config
         np.testing.assert_array_equal(sent.xyz1, clouds[number].xyz1)
+
+
+def test_arrays_of_the_host_are_computed_with_on_the_default_device():
+    _, other = jax.local_devices()
+    assert batching._devices_of(np.zeros(1)) == set(first_device())
+    with jax.default_device(other):
+        assert batching._devices_of(np.zeros(1)) == jax.jit(lambda a: a + 1)(np.zeros(1)).devices() == {other}
+    assert batching._devices_of(jax.device_put(np.zeros(1), other)) == {other}
 
 
 def test_a_batch_of_nothing_is_nothing_and_one_without_devices_is_refused():

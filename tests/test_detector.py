@@ -85,6 +85,23 @@ def test_one_trace_serves_all_real_sweeps(data_root):
     assert len(lengths) > 20
 
 
+def test_a_cloud_that_was_put_on_the_device_is_nothing_to_compile_for_and_has_the_same_bits():
+    expected, events = found(0), []
+    cloud = jax.device_put(PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY))
+
+    def listen(event, *_, **__):
+        events.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        detections = detect(cloud)
+        jax.jit(lambda x: x + 2.5)(1.0)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert_same_bits(jax.device_get(detections), expected)
+    assert sum("backend_compile" in event for event in events) == 1  # that of the line after detect
+
+
 def test_nothing_calls_back_to_the_host():
     cloud = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY)
     assert "callback" not in str(jax.make_jaxpr(detect)(cloud))

@@ -52,6 +52,13 @@ def test_a_cloud_has_the_documented_types_and_true_count():
     assert not np.asarray(cloud.intensity).any()
 
 
+def test_nobody_can_write_to_the_points_that_jax_computes_with():
+    cloud = PointCloud.from_numpy(POINTS)
+    for array in (cloud.xyz1, cloud.intensity):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 1
+
+
 @pytest.mark.parametrize("size", [0, 1, 2**14 - 1, 2**14, 2**14 + 1, 2**17, 2**20, 2**20 + 1])
 def test_the_default_capacity_is_the_least_bucket_that_holds_the_sweep(size):
     cloud = PointCloud.from_numpy(np.zeros((size, 3), np.float32))

@@ -39,11 +39,11 @@ def select_points(cloud: PointCloud, config: DetectorConfig) -> Sweep:
     """Picks the finite points in the region, and those of them that are no outliers."""
     region = stage_options(config.region)
     limits = (*region.values(), MAX_ABS_Z_M)
-    xyz1, present, finite, valid = store(_in_region(limits, cloud.xyz1))
+    xyz1, present, finite, valid = store(_in_region(limits, jnp.asarray(cloud.xyz1)))
     inlier = valid
     if config.filtering.enabled:
         inlier = filtering.filter_outliers(xyz1, **region, **stage_options(config.filtering, "enabled"))
-    return Sweep(xyz1, cloud.num_points, present, finite, valid, inlier)
+    return Sweep(xyz1, jnp.asarray(cloud.num_points), present, finite, valid, inlier)
 
 
 def _in_region(limits: tuple[float, ...], xyz1: jax.Array) -> tuple[jax.Array, ...]:
