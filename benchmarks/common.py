@@ -19,6 +19,7 @@ from jaxbox import Detections, DetectorConfig, PointCloud, Status
 from jaxbox.cli.cache import enable_cache
 from jaxbox.io import Sweep, atomic_writer, open_sweeps
 from jaxbox.settings import parse_change, replace_settings
+from jaxbox.workers import THREADS_VARIABLE
 
 PROJECT = pathlib.Path(__file__).resolve().parents[1]
 
@@ -110,6 +111,7 @@ def circumstances(options: argparse.Namespace) -> dict[str, Any]:
         "machine": platform.machine(),
         "processor": _processor(),
         "cpus": os.cpu_count(),
+        "threads": os.environ.get(THREADS_VARIABLE),
         "devices": [str(device) for device in jax.devices()],
         "device_kind": jax.devices()[0].device_kind,
     }

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import json
+import os
 import pathlib
 import shutil
 import subprocess
@@ -35,6 +36,7 @@ from jaxbox.io import (
     write_labels,
 )
 from jaxbox.types import PointCloud, Status
+from jaxbox.workers import THREADS_VARIABLE
 
 # Few beams, so that all sweeps of this file share the smallest capacity and one compile.
 CAPACITY = 16384
@@ -434,3 +436,12 @@ def test_results_without_scores_end_with_exit_code_2_and_the_file(kitti_folder, 
     result = run("eval", "--labels", kitti_folder, "--results", folder)
     assert result.exit_code == 2
     assert str(file) in result.stderr.replace("\n", "")
+
+
+@pytest.mark.parametrize(("asked", "taken"), [(None, "1"), ("3", "3")])
+def test_xla_is_told_to_take_one_thread_unless_the_user_names_another_number(monkeypatch, asked, taken):
+    monkeypatch.setenv(THREADS_VARIABLE, asked or "")
+    if asked is None:
+        monkeypatch.delenv(THREADS_VARIABLE)
+    assert CliRunner().invoke(app, ["info"]).exit_code == 0
+    assert os.environ[THREADS_VARIABLE] == taken

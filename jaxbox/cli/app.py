@@ -18,6 +18,7 @@ from jaxbox.cli.info import print_info
 from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.cli.settings import chosen_config, chosen_preset, complete_preset, complete_setting
 from jaxbox.cli.sweep_info import print_sweep_info
+from jaxbox.cli.threads import compute_on_one_thread
 from jaxbox.cli.tune import TuneOptions, run_tune
 from jaxbox.cli.view import ViewOptions, run_view
 from jaxbox.cluster.dataset import SWEEPS_PER_PARTITION
@@ -151,6 +152,7 @@ def _common(
         bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
+    compute_on_one_thread()
     enable_cache()
 
 
