@@ -60,7 +60,9 @@ def plot(table: Mapping[str, Mapping[str, float]], path: pathlib.Path) -> None:
     for name, row in table.items():
         axes.errorbar(row["median ms"], row["SOFT"], yerr=row["SOFT sd"], fmt="o", capsize=3)
         axes.annotate(name, (row["median ms"], row["SOFT"]), xytext=(8, 4), textcoords="offset points")
-    axes.set(xlabel="median time of a sweep (ms)", ylabel="SOFT", xlim=(0, None), ylim=(0, 100))
+    slowest = max(row["median ms"] for row in table.values())
+    # Room for the name of the slowest.
+    axes.set(xlabel="median time of a sweep (ms)", ylabel="SOFT", xlim=(0, 1.15 * slowest), ylim=(0, 100))
     axes.grid(alpha=0.3)
     save_figure(path, figure)
 
