@@ -66,20 +66,29 @@ def _scan_one_by_one(combine: Callable[..., jax.Array], values: jax.Array) -> ja
     return _one_by_one(size, step, (jnp.int32(0), jnp.zeros(size, jnp.int32)))[1]
 
 
-def _one_by_one(size: int, step: Callable[[jax.Array, Any], Any], state: Any) -> Any:
-    """Calls a step with each index, () uint32, and the state: XLA compiles so small a loop to native code."""
-    unroll = _unroll(size)
+def _one_by_one(
+    size: int,
+    step: Callable[[jax.Array, Any], Any],
+    state: Any,
+    *,
+    rows: int = 1,
+    num: jax.Array | None = None,
+) -> Any:
+    """Calls a step with each index, () uint32, and the state: XLA compiles so small a loop to native code.
+
+    Of several rows one after the other, and no farther than the first `num` of each, or little more.
+    """
+    unroll = next(k for k in UNROLL if size % k == 0)
+    in_use = jnp.uint32(size if num is None else (jnp.minimum(num, size) + unroll - 1) // unroll * unroll)
 
     def steps(start: jax.Array, state: Any) -> Any:
+        rows_before = sum((start >= row * in_use).astype(jnp.uint32) for row in range(1, rows))
+        first = start + rows_before * (size - in_use)
         for k in range(unroll):
-            state = step(start + k, state)
+            state = step(first + k, state)
         return state
 
-    return for_chunks(jnp.uint32(size), unroll, steps, state)
-
-
-def _unroll(size: int) -> int:
-    return next(num for num in UNROLL if size % num == 0)
+    return for_chunks(rows * in_use, unroll, steps, state)
 
 
 def count(mask: jax.Array) -> jax.Array:
@@ -180,21 +189,16 @@ def _compact_at_once(mask: jax.Array, _num: jax.Array, *, capacity: int) -> tupl
 def _compact_one_by_one(mask: jax.Array, num: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.Array]:
     """Each index is written, and the next one over it unless it counts."""
     rows, size = mask.shape
-    flags, unroll = mask.reshape(-1), _unroll(size)
-    in_use = jnp.uint32((jnp.minimum(num, size) + unroll - 1) // unroll * unroll)
+    flags = mask.reshape(-1)
 
-    def steps(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        rows_before = sum((start >= row * in_use).astype(jnp.uint32) for row in range(1, rows))
-        first = start + rows_before * (size - in_use)
+    def step(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         index, count = state
-        for k in range(unroll):
-            # Beyond the capacity the place is moved back, to the room at the end.
-            index = jax.lax.dynamic_update_slice(index, (first + k).astype(jnp.int32)[None], (count,))
-            count = count + flags[first + k].astype(jnp.uint32)
-        return index, count
+        # Beyond the capacity the place is moved back, to the room at the end.
+        index = jax.lax.dynamic_update_slice(index, i.astype(jnp.int32)[None], (count,))
+        return index, count + flags[i].astype(jnp.uint32)
 
     none = jnp.full(capacity + 1, mask.size, jnp.int32)
-    index, count = for_chunks(rows * in_use, unroll, steps, (none, jnp.uint32(0)))
+    index, count = _one_by_one(size, step, (none, jnp.uint32(0)), rows=rows, num=num)
     # Over what the last index wrote if it does not count.
     index = jax.lax.dynamic_update_slice(index, none[:1], (count,))
     return index[:capacity], count.astype(jnp.int32)
