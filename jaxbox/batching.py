@@ -9,6 +9,7 @@ import numpy as np
 
 from jaxbox.config import DetectorConfig
 from jaxbox.detector import detect
+from jaxbox.devices import default_device
 from jaxbox.types import Detections, PointCloud
 
 
@@ -88,5 +89,4 @@ def _devices_of(array: jax.Array | np.ndarray) -> set[Any]:
     """Where JAX computes with an array: with NumPy's on its default device."""
     if isinstance(array, jax.Array):
         return array.devices()
-    default = jax.config.values["jax_default_device"]  # a device, the name of a platform, or None
-    return {default if isinstance(default, jax.Device) else jax.local_devices(backend=default)[0]}
+    return {default_device()}

@@ -151,7 +151,7 @@ def _extents(clusters: PointTable, cos: jax.Array, sin: jax.Array) -> jax.Array:
     x, y, count = clusters
     # A point that is absent is seen as the first once more; a cluster without any has a first one anyhow.
     nearest = jnp.full((to_x.shape[0], x.shape[1]), -jnp.inf)
-    reach = fold_points(x, y, count, nearest, update, absent=(x[0], y[0]))
+    reach = fold_points(x, y, count, nearest, update, absent=(x[0], y[0]), reduce=jnp.max)
     sign = jnp.array([-1.0, 1.0, -1.0, 1.0])[:, None, None]
     return sign * jnp.where(count > 0, reach, 0).reshape(4, -1, x.shape[1])
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
+from jaxbox.devices import on_accelerator
 from jaxbox.loops import at_once
 from jaxbox.masked import WORD_BITS, lookup, prefix_sum, take
 
@@ -24,6 +25,9 @@ WORD_SHIFT, STRIP_SHIFT = WORD_BITS.bit_length() - 1, STRIP.bit_length() - 1
 
 MAX_STARTS = WORD_BITS // 2
 """Runs that can start among the cells of one word: an empty cell lies between two."""
+
+HOOKS, JUMPS = 4, 2
+"""Rounds of `_join_in_rounds` before it looks whether they were enough, and jumps of each."""
 
 NONE = 0
 """Cell, run and component of points that have none; the others count from 1."""
@@ -217,11 +221,7 @@ def label_components(flags: jax.Array, row: CellRow, *, max_runs: int) -> Compon
         cell=_starting_cells(starts, runs_before, max_runs),
         num=jnp.minimum(num_runs, max_runs),
     )
-    parent = jax.lax.platform_dependent(
-        runs,
-        cpu=functools.partial(_join_one_by_one, row),
-        default=functools.partial(_join_in_rounds, row),
-    )
+    parent = _join_in_rounds(row, runs) if on_accelerator() else _join_one_by_one(row, runs)
     itself = jnp.arange(max_runs, dtype=jnp.int32)
     number = prefix_sum((parent == itself) & (itself < num_runs)) - 1
 
@@ -257,6 +257,8 @@ def _prefix(count: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Sum of the counts (R, S) of all words before each, and of all words."""
     of_strip = jnp.sum(count, axis=0)
     up_to = prefix_sum(of_strip)
+    if on_accelerator():
+        return jnp.cumsum(count, axis=0) - count + (up_to - of_strip), up_to[-1]
     _, before = jax.lax.scan(lambda before, row: (before + row, before), up_to - of_strip, count)
     return before, up_to[-1]
 
@@ -387,25 +389,29 @@ def _join_in_rounds(row: CellRow, runs: _Runs) -> jax.Array:
         return jnp.where(touches, other, itself)
 
     sides = enumerate(_beside(row, runs.cell))
-    parent, *links = [link(side, cell) for side, cells in sides for cell in cells]
+    links = [link(side, cell) for side, cells in sides for cell in cells]
     node, other = jnp.tile(itself, len(links)), jnp.concatenate(links)
 
-    def hook(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        root, _ = state
-        pair = lookup(root, node), lookup(root, other)
-        low, high = jnp.minimum(*pair), jnp.maximum(*pair)
-        return _jump(root.at[high].min(low)), jnp.any(low < high)
+    def hook(parent: jax.Array) -> jax.Array:
+        pair = lookup(parent, node), lookup(parent, other)
+        return _jump(parent.at[jnp.maximum(*pair)].min(jnp.minimum(*pair)))
 
-    return jax.lax.while_loop(lambda state: state[1], hook, (_jump(parent), jnp.bool_(True)))[0]
+    def hooks(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        parent, _ = state
+        for _ in range(HOOKS):
+            parent = hook(parent)
+        # A node's parent is of its component, and no greater. So where the ends of every link have the same
+        # parent, and each parent is its own, it is the component's lowest node.
+        agree = jnp.all(lookup(parent, node) == lookup(parent, other))
+        return parent, ~(agree & jnp.all(lookup(parent, parent) == parent))
+
+    # The first rounds without a look: for that the host would wait.
+    return jax.lax.while_loop(lambda state: state[1], hooks, hooks((_jump(links[0]), jnp.bool_(True))))[0]
 
 
 def _jump(parent: jax.Array) -> jax.Array:
-    """(C,) int32: the root of each node's tree."""
-
-    def jump(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        parent, _ = state
-        higher = lookup(parent, parent)
-        higher = lookup(higher, higher)
-        return higher, jnp.any(higher != parent)
-
-    return jax.lax.while_loop(lambda state: state[1], jump, (parent, jnp.bool_(True)))[0]
+    """(C,) int32: up to 4^JUMPS steps towards the root of each node's tree."""
+    for _ in range(JUMPS):
+        higher = lookup(parent, lookup(parent, parent))
+        parent = lookup(parent, higher)
+    return parent

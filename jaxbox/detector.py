@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxbox import steps
 from jaxbox.config import DetectorConfig
-from jaxbox.devices import batch_together
+from jaxbox.devices import batch_together, building_for, on_accelerator
 from jaxbox.evidence import Evidence
 from jaxbox.loops import AT_ONCE, apart, at_once
 from jaxbox.steps.boxes import Fits
@@ -101,7 +101,11 @@ def decide(cloud: PointCloud, segments: Segments, config: DetectorConfig | None 
 
 
 def lower(
-    cloud: PointCloud, config: DetectorConfig | None = None, key: jax.Array | None = None
+    cloud: PointCloud,
+    config: DetectorConfig | None = None,
+    key: jax.Array | None = None,
+    *,
+    platform: str | None = None,
 ) -> jax.stages.Lowered:
     """The program of `detect` before it is compiled, for its text, its cost and its memory.
 
@@ -109,11 +113,16 @@ def lower(
       cloud: any of the capacity.
       config: as `detect` takes it.
       key: as `detect` takes it.
+      platform: "cpu", "cuda", "rocm" or "tpu", which need not be there; None for what JAX computes on.
 
     Returns:
       What `jax.jit(...).lower` gives.
     """
-    return _detect_jit.lower(*_operands(cloud, config, key))  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
+    if platform is None:
+        return _detect_jit.trace(*_operands(cloud, config, key)).lower()  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
+    with building_for(accelerator=platform != "cpu"):
+        operands = _operands(cloud, config, key)
+    return _detect_jit.trace(*operands).lower(lowering_platforms=(platform,))  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
 
 
 def _operands(
@@ -121,7 +130,8 @@ def _operands(
 ) -> tuple[PointCloud, "_Settings", jax.Array]:
     config = DetectorConfig() if config is None else config
     steps.check_settings(config)
-    return cloud, _Settings.pack(config), _default_key() if key is None else key
+    settings = _Settings.pack(config, accelerator=on_accelerator(cloud.xyz1))
+    return cloud, settings, _default_key() if key is None else key
 
 
 @functools.cache
@@ -142,17 +152,16 @@ class _Settings:
 
     thresholds: jax.Array | np.ndarray  # (T,) float32
     structure: Any = dataclasses.field(metadata={"static": True})
+    accelerator: bool = dataclasses.field(metadata={"static": True})  # what the program is built for
 
     @classmethod
-    def pack(cls, config: DetectorConfig) -> "_Settings":
+    def pack(cls, config: DetectorConfig, *, accelerator: bool) -> "_Settings":
         values, structure = jax.tree.flatten(config)
         traced = {i: jnp.float32(v) for i, v in enumerate(values) if isinstance(v, jax.Array)}
         known = np.array([0 if i in traced else v for i, v in enumerate(values)], np.float32)
-        if not traced:
-            return cls(known, structure)
-        return cls(
-            jnp.asarray(known).at[np.array(list(traced))].set(jnp.stack(list(traced.values()))), structure
-        )
+        if traced:
+            known = jnp.asarray(known).at[np.array(list(traced))].set(jnp.stack(list(traced.values())))
+        return cls(known, structure, accelerator)
 
     def unpack(self) -> DetectorConfig:
         # Cut up together: each threshold that a loop reads would else be a kernel of its own.
@@ -196,8 +205,9 @@ def _decide(cloud: PointCloud, segments: Segments, config: DetectorConfig) -> De
 
 
 def _find_vehicles(cloud: PointCloud, settings: _Settings, key: jax.Array) -> Detections:
-    config = settings.unpack()
-    return _decide(cloud, _segment(cloud, config, key), config)
+    with building_for(accelerator=settings.accelerator):
+        config = settings.unpack()
+        return _decide(cloud, _segment(cloud, config, key), config)
 
 
 _one_after_the_other = jax.custom_batching.sequential_vmap(_find_vehicles)
@@ -207,16 +217,20 @@ _detect_jit = jax.jit(_find)
 
 @jax.jit
 def _segment_jit(cloud: PointCloud, settings: _Settings, key: jax.Array) -> Segments:
-    return _segment(cloud, settings.unpack(), key)
+    with building_for(accelerator=settings.accelerator):
+        return _segment(cloud, settings.unpack(), key)
 
 
 @jax.jit
 def _decide_jit(cloud: PointCloud, segments: Segments, settings: _Settings) -> Detections:
-    return _decide(cloud, segments, settings.unpack())
+    with building_for(accelerator=settings.accelerator):
+        return _decide(cloud, segments, settings.unpack())
 
 
 @_find.def_vmap
-def _find_many(_size: int, batched: Any, *operands: Any) -> tuple[Detections, Any]:
+def _find_many(
+    _size: int, batched: Any, cloud: PointCloud, settings: _Settings, key: jax.Array
+) -> tuple[Detections, Any]:
     """A batch: on a CPU its sweeps one after the other, on an accelerator all of them step by step.
 
     On a CPU batched scatters, and loops that end with the largest sweep of the batch, cost more than they
@@ -225,11 +239,7 @@ def _find_many(_size: int, batched: Any, *operands: Any) -> tuple[Detections, An
     accelerator, and to launch them takes longer than to run them.
     """
     axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
-    in_turn = jax.vmap(_one_after_the_other, axes)
-    if batch_together():
-        together = jax.vmap(_find_vehicles, axes)
-        found = jax.lax.platform_dependent(*operands, cpu=in_turn, default=together)
-    else:
-        # Not even traced together, which takes ten seconds.
-        found = in_turn(*operands)
+    with building_for(accelerator=settings.accelerator):
+        find = _find_vehicles if batch_together() else _one_after_the_other
+        found = jax.vmap(find, axes)(cloud, settings, key)
     return found, jax.tree.map(lambda _: True, found)

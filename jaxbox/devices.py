@@ -1,28 +1,66 @@
-"""What JAX computes on, where that decides how a program is built. It changes results by rounding only."""
+"""What a program is built for, a CPU or an accelerator: one decision. It changes results by rounding only."""
 
+import contextlib
+import contextvars
 import os
+from collections.abc import Iterator
+from typing import Any
 
 import jax
+import jax.core
+
+_for_accelerator: contextvars.ContextVar[bool | None] = contextvars.ContextVar(
+    "for_accelerator", default=None
+)
+"""Whether what is traced in this context is for an accelerator; None for what JAX computes on here."""
 
 
-def on_accelerator() -> bool:
-    """Whether JAX's default backend is no CPU: a CPU beside an accelerator has the accelerator's program."""
-    return jax.default_backend() != "cpu"
+@contextlib.contextmanager
+def building_for(*, accelerator: bool) -> Iterator[None]:
+    """Traces programs for a CPU or for an accelerator, whatever JAX computes on here.
 
-
-def at_a_time(on_cpu: int, with_accelerator: int) -> int:
-    """How many rows a step of a loop takes: on a CPU what its cache holds, on an accelerator many more.
-
-    To launch a kernel takes an accelerator longer than to run so small a one.
+    JAX keeps what it has traced by the arguments of a function, and this is none of them: a function that
+    was traced outside must not be traced again within. `detect` carries the decision in its operands.
 
     Args:
-      on_cpu: rows.
-      with_accelerator: rows.
+      accelerator: whether for an accelerator.
+
+    Yields:
+      Nothing.
+    """
+    token = _for_accelerator.set(accelerator)
+    try:
+        yield
+    finally:
+        _for_accelerator.reset(token)
+
+
+def on_accelerator(array: Any = None) -> bool:
+    """Whether a program is built for an accelerator: the only place that decides it.
+
+    Args:
+      array: what the program is called with, if it is at hand: an array that is on a device already is
+        computed with there.
 
     Returns:
-      One of the two.
+      What `building_for` says; else by the array's device; else by JAX's default device.
     """
-    return with_accelerator if on_accelerator() else on_cpu
+    chosen = _for_accelerator.get()
+    return platform_of(array) != "cpu" if chosen is None else chosen
+
+
+def platform_of(array: Any) -> str:
+    """The platform that JAX computes on with an array: for NumPy's, tracers or None its default."""
+    if isinstance(array, jax.Array) and not isinstance(array, jax.core.Tracer):
+        return next(iter(array.devices())).platform
+    return default_device().platform
+
+
+def default_device() -> Any:
+    """The JAX device that is computed on unless it is told otherwise."""
+    # A device, the name of a platform, or None.
+    default = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    return default if isinstance(default, jax.Device) else jax.local_devices(backend=default)[0]
 
 
 def batch_together() -> bool:

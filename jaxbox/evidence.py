@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbox.devices import on_accelerator
 from jaxbox.loops import store
 from jaxbox.masked import lookup
 
@@ -209,6 +210,8 @@ def _free_words(beams: jax.Array) -> jax.Array:
 
 def _sum_before(blocks: jax.Array) -> jax.Array:
     """Sums of the rows before each row. A scan over few wide rows is the fastest of its kind (XLA, CPU)."""
+    if on_accelerator():
+        return jnp.cumsum(blocks, axis=0) - blocks
     return jax.lax.scan(lambda total, row: (total + row, total), jnp.zeros_like(blocks[0]), blocks)[1]
 
 
@@ -223,7 +226,11 @@ def _hit_words(hits: jax.Array) -> jax.Array:
     def step(beyond: jax.Array, first: jax.Array) -> tuple[jax.Array, jax.Array]:
         return jnp.minimum(beyond, first), beyond
 
-    beyond = jax.lax.scan(step, jnp.full_like(first[0], NEVER), first, reverse=True)[1]
+    if on_accelerator():
+        least = jax.lax.cummin(first, axis=0, reverse=True)
+        beyond = jnp.pad(least[1:], ((0, 1), (0, 0)), constant_values=NEVER)
+    else:
+        beyond = jax.lax.scan(step, jnp.full_like(first[0], NEVER), first, reverse=True)[1]
     return hit | (beyond << BLOCK)
 
 

@@ -4,6 +4,7 @@ What is exported takes plain arrays and gives a dictionary of plain arrays, beca
 interface would have to be there when it is loaded. ``docs/export.md`` tells how to run it.
 """
 
+import functools
 import json
 import os
 import pathlib
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 
 from jaxbox.config import DetectorConfig
 from jaxbox.detector import detect
+from jaxbox.devices import building_for, on_accelerator
 from jaxbox.io import atomic_path
 from jaxbox.types import Detections, PointCloud
 from jaxbox.version import __version__
@@ -50,7 +52,8 @@ def export_detector(
       capacity: N, points that every sweep is padded to.
       config: the settings; None for the default preset.
       key: JAX random key; None for `jax.random.key(0)`.
-      platforms: "cpu", "cuda", "rocm", "tpu"; None for the one that JAX runs on here.
+      platforms: "cpu", "cuda", "rocm", "tpu"; None for the one that JAX runs on here. The program of a CPU
+        is another than that of accelerators: where both are asked for, both are inside.
 
     Returns:
       A function of `xyz1` (N, 4) float32 and `num_points` () int32, see `PointCloud`. Its result is a
@@ -66,15 +69,24 @@ def export_detector(
     key = jax.random.key(0) if key is None else key
     values, structure = jax.tree.flatten(config)
 
-    def run(xyz1: jax.Array, num_points: jax.Array) -> dict[str, jax.Array]:
+    def run(accelerator: bool, xyz1: jax.Array, num_points: jax.Array) -> dict[str, jax.Array]:
         # Behind the barrier the compiler takes the thresholds for inputs, as `detect` has them: arithmetic
         # with constants would be ordered otherwise.
         held = jax.lax.optimization_barrier([jnp.float32(value) for value in values])
         cloud = PointCloud(xyz1, jnp.zeros(capacity), num_points)
-        return named_arrays(detect(cloud, jax.tree.unflatten(structure, held), key))
+        with building_for(accelerator=accelerator):
+            return named_arrays(detect(cloud, jax.tree.unflatten(structure, held), key))
+
+    kinds = {on_accelerator()} if platforms is None else {platform != "cpu" for platform in platforms}
+
+    def program(*inputs: jax.Array) -> dict[str, jax.Array]:
+        if len(kinds) == 1:
+            return run(True in kinds, *inputs)
+        forms = {"cpu": functools.partial(run, False), "default": functools.partial(run, True)}
+        return jax.lax.platform_dependent(*inputs, **forms)
 
     inputs = jax.ShapeDtypeStruct((capacity, 4), jnp.float32), jax.ShapeDtypeStruct((), jnp.int32)
-    return jax.export.export(jax.jit(run), platforms=platforms)(*inputs)
+    return jax.export.export(jax.jit(program), platforms=platforms)(*inputs)
 
 
 def named_arrays(detections: Detections) -> dict[str, Any]:

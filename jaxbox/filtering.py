@@ -5,6 +5,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
+from jaxbox.devices import on_accelerator
 from jaxbox.loops import for_chunks, store
 from jaxbox.masked import compact, masked_mean, masked_std
 
@@ -88,8 +89,13 @@ def filter_outliers(
             window = window_of(cell_of(_mean(window)))
         return jnp.pad(jnp.where(is_light, jnp.inf, _mean(window)), ((0, 0), (0, 1)))
 
-    ends = _of_occupied(shift, sums).reshape(-1)
-    gap = [xyz1[:, axis] - ends[4 * cells + axis] for axis in range(3)]
+    if on_accelerator():
+        # Point by point: to list the occupied cells takes as many kernels as the rest.
+        of_point = shift(cells)
+        gap = [xyz1[:, axis] - of_point[:, axis] for axis in range(3)]
+    else:
+        ends = _of_occupied(shift, sums).reshape(-1)
+        gap = [xyz1[:, axis] - ends[4 * cells + axis] for axis in range(3)]
     distance = jnp.sqrt(gap[0] ** 2 + gap[1] ** 2 + gap[2] ** 2)
     is_dense = valid & (distance < jnp.inf)
     threshold = masked_mean(distance, is_dense) + num_std * masked_std(distance, is_dense)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbox.capacities import GROUND_CANDIDATE_CELL_M
+from jaxbox.devices import on_accelerator
 from jaxbox.loops import store
 from jaxbox.masked import compact, count, greatest, lookup
 from jaxbox.types import GroundPlane
@@ -147,9 +148,17 @@ def fit_ground_plane(
     draws = _draw(key, round_index, (num_hypotheses, 3))
     picks = index[jnp.minimum((draws * num).astype(jnp.int32), jnp.maximum(num - 1, 0))]
     planes = jax.vmap(_plane_through)(candidates[jnp.minimum(picks, mask.shape[0] - 1)])
-    support = jax.lax.map(support_of, planes, batch_size=HYPOTHESES_AT_A_TIME)
+    support = (
+        jax.vmap(support_of)(planes)
+        if on_accelerator()
+        else jax.lax.map(support_of, planes, batch_size=HYPOTHESES_AT_A_TIME)
+    )
     best = planes[jnp.argmax(jnp.where(_is_level(planes.T, max_grade), support, 0))]
-    plane = jax.lax.fori_loop(0, num_refits, lambda _, p: _refit(candidates, is_near(p), p), best)
+    refit = functools.partial(_refit, candidates)
+    if on_accelerator():
+        plane = functools.reduce(lambda p, _: refit(is_near(p), p), range(num_refits), best)
+    else:
+        plane = jax.lax.fori_loop(0, num_refits, lambda _, p: refit(is_near(p), p), best)
     num_inliers = jnp.where(_is_level(plane, max_grade), count(is_near(plane)), 0)
     found = (num_inliers >= 3) & (num_inliers >= min_inlier_fraction * num)
     lowest = -greatest(jnp.where(mask, -candidates[:, 2], -jnp.inf), -jnp.inf)

@@ -1,12 +1,12 @@
 """Points by group, at a fixed shape: sorted by the number of their cell or cluster."""
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from jaxbox.devices import on_accelerator
 from jaxbox.loops import store
 from jaxbox.masked import WORD_BITS, prefix_sum
 
@@ -59,17 +59,15 @@ def sort_by_group(
     count = jnp.zeros(num_groups, jnp.int32).at[group].add(1, mode="drop")
     end = prefix_sum(count)
 
-    def place(branch: Callable[..., Any]) -> Callable[..., Any]:
-        return functools.partial(branch, read, room=room)
-
-    values = jax.lax.platform_dependent(
-        group, num_rows, end - count, cpu=place(_place_one_by_one), default=place(_place_sorted)
-    )
+    if on_accelerator():
+        values = _place_sorted(read, group, num_groups, room)
+    else:
+        values = _place_one_by_one(read, group, num_rows, end - count, room)
     return values, end - count, end
 
 
 def _place_one_by_one(
-    read: Callable[[jax.Array], Any], group: jax.Array, num_rows: jax.Array, begin: jax.Array, *, room: int
+    read: Callable[[jax.Array], Any], group: jax.Array, num_rows: jax.Array, begin: jax.Array, room: int
 ) -> Any:
     """Counting sort: XLA compiles so small a loop to native code on the CPU."""
 
@@ -85,10 +83,8 @@ def _place_one_by_one(
     return jax.lax.fori_loop(0, num_rows, step, (begin, empty))[1]
 
 
-def _place_sorted(
-    read: Callable[[jax.Array], Any], group: jax.Array, num_rows: jax.Array, begin: jax.Array, *, room: int
-) -> Any:
-    order = _stable_order(group, begin.shape[0])
+def _place_sorted(read: Callable[[jax.Array], Any], group: jax.Array, num_groups: int, room: int) -> Any:
+    order = _stable_order(group, num_groups)
     return jax.tree.map(lambda v: jnp.pad(v, (0, room)), read(order))
 
 

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from jaxbox.devices import on_accelerator
 from jaxbox.loops import fold_rows, store
 from jaxbox.masked import WORD_BITS, lookup, take
 
@@ -162,6 +163,8 @@ def _lower_hulls(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.
     Of points above one another only the lowest counts; those whose x is not a number are absent. Rows
     beyond the last vertex repeat it, or are minus infinity; the first row of an empty set is zero.
     """
+    if on_accelerator():
+        return _lower_hulls_at_once(x, y)
     far = jnp.inf
 
     def step(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
@@ -187,6 +190,32 @@ def _lower_hulls(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.
         lambda state: state[1], step, (jnp.int32(0), jnp.any(present), *chains)
     )
     return chain_x, chain_y, present + jnp.sum(chain_x[1:] > chain_x[:-1], axis=0)
+
+
+def _lower_hulls_at_once(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """As `_lower_hulls`, by all pairs of points, which is one kernel on an accelerator.
+
+    A point is a vertex where the steepest way to it from the left is less steep than the flattest way on to
+    the right, and no point lies below it (of equal ones the first counts).
+    """
+    far, num_points = jnp.inf, x.shape[0]
+    index, row = jnp.arange(num_points)[:, None], jnp.arange(num_points + 1)[:, None]
+    # The points (M, 1, C), held against all others (M, C).
+    at_x, at_y, at_index = x[:, None], y[:, None], index[:, None]
+    to_left, to_right = x < at_x, x > at_x
+    slope = (y - at_y) / jnp.where(to_left | to_right, x - at_x, 1)
+    comes_first = (y < at_y) | ((y == at_y) & (index < at_index))
+    is_lowest = ~jnp.any((x == at_x) & comes_first, axis=1)
+    arriving = jnp.max(jnp.where(to_left, slope, -far), axis=1)
+    leaving = jnp.min(jnp.where(to_right, slope, far), axis=1)
+    is_vertex = (x > -far) & is_lowest & (arriving < leaving)
+    place = jnp.sum(is_vertex & to_left, axis=1, dtype=jnp.int32)
+    # Vertex k of each chain, by its place among the vertices.
+    is_in_row = is_vertex & (place == row[:, None])
+    chain_x, chain_y = (jnp.max(jnp.where(is_in_row, values, -far), axis=1) for values in (x, y))
+    count = jnp.sum(is_vertex, axis=0, dtype=jnp.int32)
+    is_empty = (row == 0) & (count == 0)
+    return jnp.where(is_empty, 0, chain_x), jnp.where(is_empty, 0, chain_y), count
 
 
 def polygon_area(vertices: jax.Array) -> jax.Array:

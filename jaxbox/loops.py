@@ -1,18 +1,19 @@
 """Loops over rows and points at a fixed shape, and walls between what XLA would else work out twice."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxbox.devices import at_a_time, on_accelerator
+from jaxbox.devices import on_accelerator
 
 AT_ONCE = 62
 """Numbers that `at_once` may copy: what reads and writes more than a kilobyte is no small loop to XLA."""
 
-FOLD_UNROLL = 4, 16
-"""Points folded in one step of the loop over them, on a CPU and on an accelerator."""
+FOLD_UNROLL = 4
+"""Points folded in one step of the loop over them, on a CPU."""
 
 
 def store(values: Any) -> Any:
@@ -237,11 +238,14 @@ def fold_points(
     update: Callable[[Any, jax.Array, jax.Array], Any],
     *,
     absent: tuple[Any, Any],
+    reduce: Callable[..., jax.Array] = jnp.sum,
 ) -> Any:
-    """Folds the points of many clusters into a wide state, a few points of each cluster at a time.
+    """Sums up the points of many clusters, or finds what is greatest among them.
 
-    With the clusters along the last axis all arithmetic vectorises, which a reduction over an inner axis
-    does not (XLA, CPU). The loop ends with the largest cluster of the batch.
+    On an accelerator it is what each point makes of the first state, reduced over the points. A CPU folds a
+    few points of each cluster at a time into a wide state, with the clusters along the last axis: so all
+    arithmetic vectorises, which a reduction over an inner axis does not (XLA, CPU), and the loop ends with
+    the largest cluster of the batch.
 
     Args:
       x: (M, C) float32.
@@ -251,20 +255,24 @@ def fold_points(
       update: maps the state and x (C,), y (C,) to the next state.
       absent: x and y, () or (C,) each, of the points that a cluster does not have: such that `update`
         makes nothing of them.
+      reduce: static, `jnp.sum` or `jnp.max`, whichever `update` does, and `init` the neutral state of it.
 
     Returns:
       The state after the last point of each cluster.
     """
-    capacity, unroll = x.shape[0], at_a_time(*FOLD_UNROLL)
+    capacity = x.shape[0]
     there = jnp.arange(capacity)[:, None] < count
+    points = jnp.where(there, x, absent[0]), jnp.where(there, y, absent[1])
+    if on_accelerator():
+        of_point = jax.vmap(functools.partial(update, init))(*points)
+        return jax.tree.map(functools.partial(reduce, axis=0), of_point)
+
+    unroll = FOLD_UNROLL
 
     def fill(values: jax.Array, value: Any) -> jax.Array:
-        filled = jnp.where(there, values, value)
-        more = jnp.broadcast_to(value, (-capacity % unroll, values.shape[1]))
-        return jnp.concatenate([filled, more])
+        return jnp.concatenate([values, jnp.broadcast_to(value, (-capacity % unroll, values.shape[1]))])
 
-    filled = fill(x, absent[0]), fill(y, absent[1])
-
+    filled = fill(points[0], absent[0]), fill(points[1], absent[1])
     most = jnp.minimum(jnp.max(count, initial=0), capacity)
 
     def step(loop: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:

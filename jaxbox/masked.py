@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxbox.devices import on_accelerator
 from jaxbox.loops import for_chunks
 
 BLOCK = 512
@@ -36,8 +37,7 @@ def prefix_sum(values: jax.Array) -> jax.Array:
     >>> prefix_sum(jnp.array([1, 0, 2])).tolist()
     [1, 1, 3]
     """
-    one_by_one = functools.partial(_scan_one_by_one, jnp.add)
-    return jax.lax.platform_dependent(values, cpu=one_by_one, default=_sum_in_blocks)
+    return _sum_in_blocks(values) if on_accelerator() else _scan_one_by_one(jnp.add, values)
 
 
 def prefix_max(values: jax.Array) -> jax.Array:
@@ -52,8 +52,7 @@ def prefix_max(values: jax.Array) -> jax.Array:
     >>> prefix_max(jnp.array([1, 0, 2])).tolist()
     [1, 1, 2]
     """
-    one_by_one = functools.partial(_scan_one_by_one, jnp.maximum)
-    return jax.lax.platform_dependent(values, cpu=one_by_one, default=jax.lax.cummax)
+    return jax.lax.cummax(values) if on_accelerator() else _scan_one_by_one(jnp.maximum, values)
 
 
 def _scan_one_by_one(combine: Callable[..., jax.Array], values: jax.Array) -> jax.Array:
@@ -103,9 +102,9 @@ def count(mask: jax.Array) -> jax.Array:
     >>> int(count(jnp.array([True, False, True])))
     2
     """
-    one_by_one = functools.partial(_fold_one_by_one, jnp.add, 0)
-    every = functools.partial(jnp.sum, dtype=jnp.int32)
-    return jax.lax.platform_dependent(mask.astype(jnp.int32), cpu=one_by_one, default=every)
+    if on_accelerator():
+        return jnp.sum(mask, dtype=jnp.int32)
+    return _fold_one_by_one(jnp.add, 0, mask.astype(jnp.int32))
 
 
 def greatest(values: jax.Array, initial: float) -> jax.Array:
@@ -121,9 +120,9 @@ def greatest(values: jax.Array, initial: float) -> jax.Array:
     >>> int(greatest(jnp.array([1, 3, 2]), 0))
     3
     """
-    one_by_one = functools.partial(_fold_one_by_one, jnp.maximum, initial)
-    every = functools.partial(jnp.max, initial=initial)
-    return jax.lax.platform_dependent(values, cpu=one_by_one, default=every)
+    if on_accelerator():
+        return jnp.max(values, initial=initial)
+    return _fold_one_by_one(jnp.maximum, initial, values)
 
 
 def _fold_one_by_one(combine: Callable[..., jax.Array], initial: float, values: jax.Array) -> jax.Array:
@@ -169,16 +168,13 @@ def compact(mask: jax.Array, capacity: int, *, num: jax.Array | None = None) -> 
     >>> compact(jnp.array([False, True, True]), 4)[0].tolist()
     [1, 2, 3, 3]
     """
-    return jax.lax.platform_dependent(
-        jnp.atleast_2d(mask),
-        jnp.int32(mask.shape[-1]) if num is None else num,
-        cpu=functools.partial(_compact_one_by_one, capacity=capacity),
-        default=functools.partial(_compact_at_once, capacity=capacity),
-    )
+    if on_accelerator():
+        return _compact_at_once(mask.reshape(-1), capacity)
+    every = jnp.int32(mask.shape[-1])
+    return _compact_one_by_one(jnp.atleast_2d(mask), every if num is None else num, capacity)
 
 
-def _compact_at_once(mask: jax.Array, _num: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.Array]:
-    mask = mask.reshape(-1)
+def _compact_at_once(mask: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
     order = prefix_sum(mask)
     target = jnp.where(mask, order - 1, capacity)
     index = jnp.full(capacity, mask.size, jnp.int32)
@@ -186,7 +182,7 @@ def _compact_at_once(mask: jax.Array, _num: jax.Array, *, capacity: int) -> tupl
     return index, order[-1]
 
 
-def _compact_one_by_one(mask: jax.Array, num: jax.Array, *, capacity: int) -> tuple[jax.Array, jax.Array]:
+def _compact_one_by_one(mask: jax.Array, num: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
     """Each index is written, and the next one over it unless it counts."""
     rows, size = mask.shape
     flags = mask.reshape(-1)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbox.devices import on_accelerator
 from jaxbox.loops import at_once, map_rows, store
 from jaxbox.masked import lookup, prefix_sum, take
 from jaxbox.types import Clusters
@@ -76,11 +77,8 @@ def find_statistics(
     num_points = jnp.minimum(num_points, height.shape[0])
     none = jnp.broadcast_to(jnp.where(IS_BOUND, -jnp.inf, 0), (max_components, NUM_COLUMNS))
     points = xy, height, in_slab
-    return Statistics(
-        jax.lax.platform_dependent(
-            none, component, num_points, points, cpu=_add_one_by_one, default=_add_at_once
-        )
-    )
+    add = _add_at_once if on_accelerator() else _add_one_by_one
+    return Statistics(add(none, component, num_points, points))
 
 
 Points = tuple[jax.Array, jax.Array, jax.Array]

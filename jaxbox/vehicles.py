@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbox.devices import on_accelerator
 from jaxbox.geometry import rectangle_iou
 from jaxbox.grouping import sort_by_group
 from jaxbox.loops import for_chunks, map_rows
@@ -23,8 +24,8 @@ MAX_CELL_ROWS = 24
 BLOCK_POINTS = 32
 """Neighbouring points are looked at in blocks of so many."""
 
-LOOKUP_BLOCKS = 1024
-"""Blocks looked at in one go."""
+LOOKUP_BLOCKS, LOOKUP_BLOCKS_AT_ONCE = 1024, 8192
+"""Blocks looked at in one go, on a CPU and on an accelerator."""
 
 COUNT_BITS = BLOCK_POINTS.bit_length()
 """Bits that hold a count of the points of a block."""
@@ -41,6 +42,9 @@ LOWEST_LEVEL = 0.4
 DOUBT_POINTS = 5
 """So many upper points, with the share of full worth behind the faces, are taken for granted: of few
 points the share says little."""
+
+ROUNDS = 6
+"""Rounds of suppression on an accelerator before the host looks whether they were enough."""
 
 BOX_CHUNK = 128
 """Boxes looked at together."""
@@ -207,16 +211,17 @@ def _count_runs(
     """
     num_boxes, runs = first.shape
     first, length = first.reshape(-1), length.reshape(-1)
+    at_once = LOOKUP_BLOCKS_AT_ONCE if on_accelerator() else LOOKUP_BLOCKS
     num_blocks = (length + BLOCK_POINTS - 1) // BLOCK_POINTS
     end = prefix_sum(num_blocks)
     begin = end - num_blocks
 
     def step(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         # The run of each block: that which begins last, before it or with it.
-        place = start.astype(jnp.int32) + jnp.arange(LOOKUP_BLOCKS)
+        place = start.astype(jnp.int32) + jnp.arange(at_once)
         present = (num_blocks > 0) & (end > place[0]) & (begin <= place[-1])
-        at = jnp.where(present, jnp.maximum(begin - place[0], 0), LOOKUP_BLOCKS)
-        run = jnp.zeros(LOOKUP_BLOCKS, jnp.int32).at[at].max(jnp.arange(end.shape[0]), mode="drop")
+        at = jnp.where(present, jnp.maximum(begin - place[0], 0), at_once)
+        run = jnp.zeros(at_once, jnp.int32).at[at].max(jnp.arange(end.shape[0]), mode="drop")
         run = prefix_max(run)
         offset = (place - begin[run]) * BLOCK_POINTS
         left = jnp.where(place < end[-1], length[run] - offset, 0)
@@ -233,10 +238,10 @@ def _count_runs(
             frames[box], there, [block(column) for column in points], margin_m, ring_m, upper_height_m
         )
         counts = (words[:, :, None] >> jnp.arange(NUM_KINDS) * COUNT_BITS) & (2**COUNT_BITS - 1)
-        return state[0].at[box].add(counts.reshape(LOOKUP_BLOCKS, -1)), state[1].at[box].max(highest)
+        return state[0].at[box].add(counts.reshape(at_once, -1)), state[1].at[box].max(highest)
 
     none = jnp.zeros((num_boxes, NUM_KINDS + NUM_LEVELS), jnp.int32), jnp.zeros(num_boxes)
-    counts, highest = for_chunks(end[-1], LOOKUP_BLOCKS, step, none)
+    counts, highest = for_chunks(end[-1], at_once, step, none)
     return counts.astype(jnp.float32), highest
 
 
@@ -434,6 +439,8 @@ def suppress(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | flo
 
     Reference: oracle `jaxbox.reference.suppress`.
     """
+    if on_accelerator():
+        return _suppress_at_once(boxes, valid, max_overlap)
     rivals = _overlaps(boxes, count(valid), max_overlap)[: valid.shape[0]]
 
     def without_rivals(keep: jax.Array) -> jax.Array:
@@ -448,6 +455,22 @@ def suppress(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | flo
     every = _pack(valid)
     init = jnp.zeros_like(every), every
     return without_rivals(jax.lax.while_loop(lambda s: jnp.any(s[0] != s[1]), step, init)[1])
+
+
+def _suppress_at_once(boxes: jax.Array, valid: jax.Array, max_overlap: jax.Array | float) -> jax.Array:
+    """As `suppress`, all pairs at once, and some rounds before the host looks whether they were enough."""
+    row = jnp.arange(valid.shape[0])
+    iou = jax.vmap(jax.vmap(rectangle_iou, (None, 0)), (0, None))(boxes, boxes)
+    rivals = (iou > max_overlap) & (row < row[:, None])
+
+    def step(keep: jax.Array) -> jax.Array:
+        return valid & ~jnp.any(rivals & keep, axis=1)
+
+    def rounds(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        before_last = functools.reduce(lambda keep, _: step(keep), range(ROUNDS - 1), state[1])
+        return before_last, step(before_last)
+
+    return jax.lax.while_loop(lambda s: jnp.any(s[0] != s[1]), rounds, rounds((valid, valid)))[1]
 
 
 def _overlaps(boxes: jax.Array, num_boxes: jax.Array, max_overlap: jax.Array | float) -> jax.Array:

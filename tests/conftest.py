@@ -10,6 +10,8 @@ import jax
 import parity
 import pytest
 
+from jaxbox import devices
+
 DATA = pathlib.Path(os.environ.get("JAXBOX_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
 
 
@@ -55,15 +57,25 @@ def cases(request: pytest.FixtureRequest) -> tuple[parity.Case, ...]:
     return parity.real_cases(request.getfixturevalue("data_root"))
 
 
-@pytest.fixture(params=["cpu", "default"])
+@pytest.fixture(params=["cpu", "accelerator"])
 def platform(request, monkeypatch):
-    """Either form of what is done otherwise on a CPU, whatever the tests run on."""
-    taken = []
+    """Either form of what is done otherwise on a CPU, whatever the tests run on.
 
-    def take_branch(*args, **branches):
-        taken.append(request.param)
-        return branches[request.param](*args)
+    Functions that were jitted before would keep the form that they were traced in: a test jits its own.
+    """
+    asked = []
+    chosen = devices._for_accelerator
 
-    monkeypatch.setattr(jax.lax, "platform_dependent", take_branch)
-    yield request.param
-    assert taken, "Traced before: jit a function of the test's own."
+    class Watched:
+        """The context variable, which notes that it was read."""
+
+        def get(self):
+            asked.append(request.param)
+            return chosen.get()
+
+        set, reset = chosen.set, chosen.reset
+
+    monkeypatch.setattr(devices, "_for_accelerator", Watched())
+    with devices.building_for(accelerator=request.param == "accelerator"):
+        yield request.param
+    assert asked, "Traced before: jit a function of the test's own."

@@ -10,7 +10,7 @@ import pytest
 from test_masked import count_loops
 
 from benchmarks import bad_input
-from jaxbox import DetectorConfig, PointCloud, Status, detect, detector, stack_clouds, synthetic
+from jaxbox import DetectorConfig, PointCloud, Status, detect, detector, devices, stack_clouds, synthetic
 from jaxbox.config import BoxConfig, EvidenceConfig
 from jaxbox.geometry import rectangle_iou
 from jaxbox.io import open_sweeps
@@ -112,7 +112,7 @@ def test_nothing_calls_back_to_the_host():
 
 @pytest.mark.parametrize("preset", DetectorConfig.presets().values())
 def test_thresholds_go_in_as_one_array_that_native_loops_cut_up(preset):
-    settings = detector._Settings.pack(preset)
+    settings = detector._Settings.pack(preset, accelerator=False)
     unpack = jax.jit(detector._Settings.unpack)
     assert unpack(settings) == jax.tree.map(jnp.float32, preset)
     num_loops, num_native = count_loops(unpack, settings)
@@ -177,25 +177,20 @@ def batch_anew(clouds):
     return find, detector._operands(clouds, None, None)
 
 
-def test_both_ways_of_a_batch_have_the_shapes_of_the_singles_and_an_axis_more(monkeypatch):
+def test_a_batch_for_an_accelerator_has_the_shapes_of_the_singles_and_an_axis_more():
     clouds = stack_clouds([PointCloud.from_numpy(street(seed).xyz, capacity=CAPACITY) for seed in (0, 1)])
-    # So that the way for accelerators is built beside the one for CPUs.
-    monkeypatch.setattr(jax, "default_backend", lambda: "cuda")
-    find, operands = batch_anew(clouds)
-    batch = jax.eval_shape(find, *operands)
-    monkeypatch.undo()
-    assert_shapes_of_singles(batch, 2)
+    with devices.building_for(accelerator=True):
+        find, operands = batch_anew(clouds)
+    assert_shapes_of_singles(jax.eval_shape(find, *operands), 2)
 
 
-def test_a_batch_on_an_accelerator_finds_what_the_singles_do_on_a_cpu(monkeypatch):
+def test_a_batch_on_an_accelerator_finds_what_the_singles_do_on_a_cpu():
     sweeps = [street(0).xyz, np.zeros((0, 3)), street(1).xyz]
     clouds = stack_clouds([PointCloud.from_numpy(xyz, capacity=CAPACITY) for xyz in sweeps])
     # Run here, where it is slower: all sweeps at once, and each loop in its form for accelerators.
-    monkeypatch.setattr(jax, "default_backend", lambda: "cuda")
-    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, default, **_: default(*args))
-    find, operands = batch_anew(clouds)
+    with devices.building_for(accelerator=True):
+        find, operands = batch_anew(clouds)
     many = jax.device_get(find(*operands))
-    monkeypatch.undo()
     for row, xyz in enumerate(sweeps):
         single = run(xyz)
         # Rounded otherwise, so that a point on a border may fall to the other side of it.
@@ -209,19 +204,18 @@ def test_a_batch_on_an_accelerator_finds_what_the_singles_do_on_a_cpu(monkeypatc
 
 
 @pytest.mark.parametrize(
-    ("backend", "flags", "together"),
-    [("cpu", "", False), ("cuda", "", True), ("cuda", "--xla_gpu_deterministic_ops=true", False)],
+    ("accelerator", "flags", "together"),
+    [(False, "", False), (True, "", True), (True, "--xla_gpu_deterministic_ops=true", False)],
 )
 def test_only_an_accelerator_takes_a_batch_at_once_and_not_where_scatters_are_ordered(
-    backend, flags, together, monkeypatch
+    accelerator, flags, together, monkeypatch
 ):
-    monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *args, default, **_: default(*args))
     monkeypatch.setenv("XLA_FLAGS", flags)
-    monkeypatch.setattr(detector, "_one_after_the_other", lambda a, b: a + b)
-    monkeypatch.setattr(detector, "_find_vehicles", lambda a, b: a - b)
+    monkeypatch.setattr(detector, "_one_after_the_other", lambda a, _, b: a + b)
+    monkeypatch.setattr(detector, "_find_vehicles", lambda a, _, b: a - b)
     a, b = jnp.arange(3.0), jnp.float32(2)
-    found, batched = detector._find_many(3, (True, False), a, b)
+    settings = detector._Settings.pack(DetectorConfig(), accelerator=accelerator)
+    found, batched = detector._find_many(3, (True, False, False), a, settings, b)
     assert batched
     np.testing.assert_array_equal(found, a - b if together else a + b)
 

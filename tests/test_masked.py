@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbox import grouping, loops, masked
+from jaxbox import devices, grouping, loops, masked
 
 SIZES = (1, 2, masked.BLOCK - 1, masked.BLOCK, masked.BLOCK + 1, 3 * masked.BLOCK + 7)
 
@@ -146,15 +146,8 @@ def test_count_true_counts_every_mask_also_where_all_are_true(size):
     assert masked.count_true(*map(jnp.asarray, masks)).tolist() == [mask.sum() for mask in masks]
 
 
-@pytest.fixture(params=["cpu", "cuda"])
-def backend(request, monkeypatch):
-    """What JAX says that it computes on."""
-    monkeypatch.setattr(jax, "default_backend", lambda: request.param)
-    return request.param
-
-
 @pytest.mark.parametrize("wall", ["store", "apart", "none"])
-def test_what_stands_behind_a_wall_is_computed_once_for_all_who_read_it(wall, backend):
+def test_what_stands_behind_a_wall_is_computed_once_for_all_who_read_it(wall, platform):
     walls = {"store": lambda x: loops.store(jnp.sin(x)), "apart": lambda x: loops.apart(jnp.sin, x)}
     sine = walls.get(wall, jnp.sin)
 
@@ -164,13 +157,13 @@ def test_what_stands_behind_a_wall_is_computed_once_for_all_who_read_it(wall, ba
 
     x = jax.device_put(np.linspace(0, 9, 5000, dtype=np.float32), jax.devices("cpu")[0])
     program = jax.jit(read_twice).lower(x).compile()
-    has_wall = backend == "cpu" and wall in walls
+    has_wall = not devices.on_accelerator() and wall in walls
     assert program.as_text().count(" sine(") == (1 if has_wall else 2)
     np.testing.assert_array_equal(program(x)[1], 2 * np.asarray(jnp.sin(x))[::-1])
 
 
 @pytest.mark.parametrize("num_rows", [0, 1, 8, 19, 20])
-def test_fold_rows_sees_each_row_once_and_no_chunk_beyond_those_that_count(num_rows, backend):
+def test_fold_rows_sees_each_row_once_and_no_chunk_beyond_those_that_count(num_rows, platform):
     def add(state, index, rows):
         total, seen = state
         return total + jnp.sum(rows), seen.at[index].add(1)
@@ -178,15 +171,15 @@ def test_fold_rows_sees_each_row_once_and_no_chunk_beyond_those_that_count(num_r
     start = jnp.int32(0), jnp.zeros(24, jnp.int32)
     rows, count = jnp.arange(20) + 1, jnp.int32(num_rows)
     total, seen = loops.fold_rows(add, start, rows, num_rows=count, chunk=8, absent=0)
-    num_seen = -(-num_rows // 8) * 8 if backend == "cpu" else 20
+    num_seen = -(-num_rows // 8) * 8 if platform == "cpu" else 20
     assert int(total) == num_rows * (num_rows + 1) // 2
     assert seen.tolist() == [1] * num_seen + [0] * (24 - num_seen)
 
 
 @pytest.mark.parametrize("chunk", [1, 4, 16])
-def test_map_rows_equals_the_function_on_all_rows_and_zero_beyond_the_last_chunk(chunk, backend):
+def test_map_rows_equals_the_function_on_all_rows_and_zero_beyond_the_last_chunk(chunk, platform):
     rows = {"a": jnp.arange(1.0, 11), "b": jnp.ones((10, 2), jnp.int32)}
-    at_a_time = chunk if backend == "cpu" else 10
+    at_a_time = chunk if platform == "cpu" else 10
 
     def function(row):
         assert row["a"].shape == (at_a_time,)
@@ -196,15 +189,15 @@ def test_map_rows_equals_the_function_on_all_rows_and_zero_beyond_the_last_chunk
     values = np.arange(1.0, 11)
     for num_rows in (0, 1, 4, 5, 9, 10, 99):
         product, large = mapped(num_rows)
-        done = np.arange(10) < (-(-min(num_rows, 10) // chunk) * chunk if backend == "cpu" else 10)
+        done = np.arange(10) < (-(-min(num_rows, 10) // chunk) * chunk if platform == "cpu" else 10)
         np.testing.assert_array_equal(product, np.where(done, values, 0)[:, None] * np.ones(2))
         np.testing.assert_array_equal(large, done & (values > 3))
 
 
-def test_map_rows_maps_along_the_last_axis_too(backend):
+def test_map_rows_maps_along_the_last_axis_too(platform):
     values = jnp.arange(20.0).reshape(2, 10)
     mapped = loops.map_rows(lambda v: 2 * v, values, num_rows=jnp.int32(5), chunk=4, axis=-1)
-    done = jnp.arange(10) < (8 if backend == "cpu" else 10)
+    done = jnp.arange(10) < (8 if platform == "cpu" else 10)
     np.testing.assert_array_equal(mapped, jnp.where(done, 2 * values, 0))
 
 
@@ -246,22 +239,22 @@ def test_largest_first_is_a_stable_sort_by_descending_size_on_every_platform(max
     np.testing.assert_array_equal(order[place], np.arange(700))
 
 
-def test_fold_points_sees_each_point_of_each_cluster_once_and_in_order(backend):
+@pytest.mark.parametrize(("reduce", "combine", "initial"), [("sum", jnp.add, 0), ("max", jnp.maximum, -7)])
+def test_fold_points_takes_each_point_of_each_cluster_once(reduce, combine, initial, platform):
     x, y = np.random.default_rng(4).normal(size=(2, 6, 3)).astype(np.float32)
 
     def update(state, x, y):
-        total, last = state
-        there = x < 9
-        return total + jnp.where(there, jnp.stack([x, y]), 0), jnp.where(there, x, last)
+        return combine(state, jnp.where(x < 9, jnp.stack([x, y]), initial))
 
-    fold = jax.jit(lambda counts: loops.fold_points(x, y, counts, init, update, absent=(9.0, jnp.zeros(3))))
-    init = jnp.zeros((2, 3)), jnp.full(3, 7.0)
+    options = {"absent": (9.0, jnp.zeros(3)), "reduce": getattr(jnp, reduce)}
+    init = jnp.full((2, 3), initial, jnp.float32)
+    fold = jax.jit(lambda counts: loops.fold_points(x, y, counts, init, update, **options))
     for counts in ([0, 0, 0], [1, 0, 6], [6, 6, 6], [2, 9, 3]):
-        total, last = fold(jnp.array(counts))
+        found = fold(jnp.array(counts))
         for cluster, count in enumerate(np.minimum(counts, 6)):
-            expected = np.stack([x, y])[:, :count, cluster].sum(axis=1)
-            np.testing.assert_allclose(total[:, cluster], expected, atol=1e-5)
-            assert float(last[cluster]) == (x[count - 1, cluster] if count else 7.0)
+            points = np.stack([x, y])[:, :count, cluster]
+            expected = getattr(points, reduce)(axis=1, initial=initial)
+            np.testing.assert_allclose(found[:, cluster], expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 1.0])
@@ -269,8 +262,8 @@ def test_fold_points_sees_each_point_of_each_cluster_once_and_in_order(backend):
 def test_both_ways_to_compact_give_the_same(share, capacity):
     for size in (1, 31, 32, 1000):
         mask = jnp.asarray(np.random.default_rng(size).random(size) < share)
-        ways = masked._compact_one_by_one, masked._compact_at_once
-        one, other = (way(mask[None], jnp.int32(size), capacity=capacity) for way in ways)
+        one = masked._compact_one_by_one(mask[None], jnp.int32(size), capacity)
+        other = masked._compact_at_once(mask, capacity)
         np.testing.assert_array_equal(one[0], other[0])
         assert int(one[1]) == int(other[1]) == int(mask.sum())
 

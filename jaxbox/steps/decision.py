@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from jaxbox import evidence, vehicles
 from jaxbox.config import DetectorConfig
+from jaxbox.devices import on_accelerator
 from jaxbox.geometry import wrap_yaw
 from jaxbox.loops import for_chunks, map_rows
 from jaxbox.masked import compact, take
@@ -196,6 +197,9 @@ def _early_score(
 def _choose(score: jax.Array, capacity: int, min_score: jax.Array | float) -> tuple[jax.Array, jax.Array]:
     """Rows with scores above the least, the highest where they are too many, and their true number."""
     above = score > min_score
+    if on_accelerator():
+        above_and_high = above & (_num_better(score) < capacity)
+        return compact(above_and_high, capacity)[0], jnp.sum(above, dtype=jnp.int32)
     row, num = compact(above, capacity)
 
     def highest() -> jax.Array:
@@ -205,6 +209,13 @@ def _choose(score: jax.Array, capacity: int, min_score: jax.Array | float) -> tu
     if capacity >= score.shape[0]:
         return row, num
     return jax.lax.cond(num > capacity, highest, lambda: row), num
+
+
+def _num_better(score: jax.Array) -> jax.Array:
+    """(P,) int32: how many rows have a higher score, or the same and come before."""
+    row = jnp.arange(score.shape[0])
+    better = (score > score[:, None]) | ((score == score[:, None]) & (row < row[:, None]))
+    return jnp.sum(better, axis=1, dtype=jnp.int32)
 
 
 def _best_first(score: jax.Array, num: jax.Array) -> jax.Array:
@@ -223,5 +234,8 @@ def _best_first(score: jax.Array, num: jax.Array) -> jax.Array:
             place = place + ((rival > score) | ((rival == score) & (other.astype(jnp.int32) < row)))
         return place
 
+    if on_accelerator():
+        place = _num_better(score)
+        return jnp.full(size, size).at[jnp.where(score > 0, place, size)].set(row, mode="drop")
     place = for_chunks(num, RANK_STEP, step, jnp.zeros_like(row), capacity=size)
     return jnp.full(size, size).at[jnp.where(score > 0, place, size)].set(row, mode="drop")

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxbox import clustering, selection
 from jaxbox.class_priors import ClassPrior
 from jaxbox.config import DetectorConfig
+from jaxbox.devices import on_accelerator
 from jaxbox.loops import fold_rows, for_chunks, map_rows, store
 from jaxbox.masked import compact, lookup, split_index, take
 from jaxbox.steps.common import stage_options
@@ -92,24 +93,34 @@ def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Proposals:
 
 
 def _fold_chunks(step: Callable[[jax.Array, Any], Any], init: Any, obstacles: Obstacles) -> Any:
-    """Calls a step with the first row of each chunk that holds points, and its state."""
+    """Calls a step with the first row of each chunk that holds points, and its state.
+
+    On an accelerator once, with all points: the host would wait for the end of each chunk.
+    """
+    if on_accelerator():
+        return step(jnp.uint32(0), init)
     return for_chunks(obstacles.count, CHUNK, step, init, capacity=obstacles.height.shape[0])
 
 
 def _for_maps(num_maps: int, step: Callable[[jax.Array, Any], Any], state: Any) -> Any:
     """Map after map: what is written out for each would have kernels for each."""
+    if on_accelerator():
+        return functools.reduce(lambda state, i: step(jnp.uint32(i), state), range(num_maps), state)
     return jax.lax.fori_loop(jnp.uint32(0), jnp.uint32(num_maps), step, state)
 
 
 def _chunk(values: jax.Array, start: jax.Array) -> jax.Array:
     """Rows of a chunk; zeros beyond the last."""
+    if on_accelerator():
+        return values
     whole = jnp.pad(values, [(0, -values.shape[0] % CHUNK)] + [(0, 0)] * (values.ndim - 1))
     return jax.lax.dynamic_slice_in_dim(whole, start, CHUNK)
 
 
 def _on_map(table: jax.Array, i: jax.Array, start: jax.Array) -> jax.Array:
     """(CHUNK,) what a table (maps, O) says of a chunk of points on map i."""
-    return jax.lax.dynamic_slice(table, (i, start), (1, CHUNK))[0]
+    size = table.shape[1] if on_accelerator() else CHUNK
+    return jax.lax.dynamic_slice(table, (i, start), (1, size))[0]
 
 
 def _store(table: jax.Array, i: jax.Array, start: jax.Array, values: jax.Array) -> jax.Array:
@@ -133,9 +144,11 @@ def _find_cells(
         **stage_options(config.region),
     )
 
+    size = obstacles.height.shape[0]
+
     def step(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         table, flags = state
-        present = start + jnp.arange(CHUNK) < obstacles.count
+        present = start + jnp.arange(size if on_accelerator() else CHUNK) < obstacles.count
         # Stored, or each map would draw the points together anew.
         xy = store(warp(_chunk(obstacles.xy, start)))
         for i, cell in enumerate(find(xy, _chunk(obstacles.height, start), present)):
@@ -143,8 +156,7 @@ def _find_cells(
             table = _store(table, jnp.uint32(i), start, cell)
         return table, flags
 
-    size = obstacles.height.shape[0]
-    table = jnp.zeros((len(maps), size + -size % CHUNK), jnp.int32)
+    table = jnp.zeros((len(maps), size if on_accelerator() else size + -size % CHUNK), jnp.int32)
     return _fold_chunks(step, (table, jnp.zeros(cells.num_flags, jnp.uint8)), obstacles)
 
 
