@@ -65,7 +65,8 @@ def test_the_decision_is_by_the_context_then_the_arrays_device_then_the_default(
     here = jax.device_put(jnp.zeros(3), jax.devices("cpu")[0])
     assert not devices.on_accelerator()
     with devices.building_for(accelerator=True):
-        assert devices.on_accelerator() and devices.on_accelerator(here)
+        assert devices.on_accelerator()
+        assert devices.on_accelerator(here)
         with devices.building_for(accelerator=False):
             assert not devices.on_accelerator()
     assert not devices.on_accelerator(here)
