@@ -137,9 +137,10 @@ def time_steps(
         proposals = run("propose_clusters", obstacles, config)
         fits = run("fit_rectangles", obstacles, proposals, config)
         seen = run("build_evidence", sweep, heights, config)
-        trials, boxes = run("complete_boxes", fits, proposals, seen, config)
+        trials, boxes, num_assignments = run("complete_boxes", fits, proposals, seen, config)
         candidates = run("score_boxes", trials, boxes, proposals, obstacles, heights, seen, config)
-        run("conclude", cloud, sweep, heights, obstacles, proposals, fits, candidates, config)
+        found = obstacles, proposals, fits, candidates, num_assignments
+        run("conclude", cloud, sweep, heights, *found, config)
     return {name: common.spread(spent[name]) | floors[name] for name in STEPS}
 
 

@@ -263,6 +263,8 @@ class CompletionConfig:
     """Lengths read short by this: bumpers are round, and the far one is seen last."""
     width_margin_m: Scalar = 0.06
     """Widths read short by this."""
+    max_assignments: int = _static(default=4096)
+    """static: capacity for sides of rectangles that the evidence weighs as the length of a class."""
     num_rays: int = _static(default=32)
     """static: rays over the box when hypotheses are compared."""
     num_final_rays: int = _static(default=48)

@@ -198,10 +198,12 @@ def _segment(cloud: PointCloud, config: DetectorConfig, key: jax.Array) -> Segme
 def _decide(cloud: PointCloud, segments: Segments, config: DetectorConfig) -> Detections:
     sweep, heights, obstacles, proposals, fits, seen = segments
     # Correction for occluded objects: what the beams saw decides how each box goes on out of sight.
-    trials, boxes = apart(steps.complete_boxes, fits, proposals, seen, config)
+    trials, boxes, num_assignments = apart(steps.complete_boxes, fits, proposals, seen, config)
     # Vehicle decision: score, suppression, and (3.5) the descriptors of what is left.
     candidates = apart(steps.score_boxes, trials, boxes, proposals, obstacles, heights, seen, config)
-    return apart(steps.conclude, cloud, sweep, heights, obstacles, proposals, fits, candidates, config)
+    return apart(
+        steps.conclude, cloud, sweep, heights, obstacles, proposals, fits, candidates, num_assignments, config
+    )
 
 
 def _find_vehicles(cloud: PointCloud, settings: _Settings, key: jax.Array) -> Detections:

@@ -220,6 +220,7 @@ def _capacities(counts: Counts, num_rows: int, config: DetectorConfig) -> Sequen
     return [
         *uses,
         CapacityUse("vehicles.max_large", int(counts.large_clusters), vehicles.max_large),
+        CapacityUse("completion.max_assignments", int(counts.assignments), config.completion.max_assignments),
         CapacityUse("vehicles.max_candidates", int(counts.candidates), vehicles.max_candidates),
         CapacityUse("vehicles.max_detections", int(counts.detections), vehicles.max_detections),
         CapacityUse("hull.max_vertices", int(counts.hull_vertices), config.hull.max_vertices),

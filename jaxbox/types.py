@@ -46,6 +46,7 @@ class Status(enum.IntFlag):
     DETECTION_OVERFLOW = 256
     HULL_OVERFLOW = 512
     GROUND_ABOVE = 1024
+    ASSIGNMENT_OVERFLOW = 2048
 
     def describe(self) -> list[str]:
         """Returns one sentence a set bit: what happened and what to do about it.
@@ -69,6 +70,9 @@ _STATUS_TEXT = {
     Status.CLUSTER_OVERFLOW: "a component map has more clusters than its max_clusters, and those beyond it "
     "were not examined; or more clusters are high than vehicles.max_large, and those beyond it were "
     "tried as cars only.",
+    Status.ASSIGNMENT_OVERFLOW: "the evidence has more boxes to weigh, each side of a cluster's rectangle as "
+    "the length of each class, than completion.max_assignments; those of the clusters with the fewest points "
+    "were not weighed.",
     Status.CANDIDATE_OVERFLOW: "more boxes scored well by rays and size than vehicles.max_candidates; "
     "the lowest-scoring were dropped.",
     Status.DETECTION_OVERFLOW: "more detections than vehicles.max_detections; "
@@ -324,6 +328,9 @@ class Counts:
     large_clusters: jax.Array
     """() int32: clusters of all maps that are tried as a van and a truck too, which vehicles.max_large
     must hold."""
+    assignments: jax.Array
+    """() int32: sides of the clusters' rectangles that may be the length of a class, which
+    completion.max_assignments must hold; 0 where no evidence weighs them."""
     candidates: jax.Array
     """() int32: boxes whose score by rays and size passes vehicles.min_score, before a look at what
     surrounds them, which vehicles.max_candidates must hold."""
@@ -427,6 +434,7 @@ _OVERFLOW_BITS = (
     Status.OBSTACLE_OVERFLOW,
     Status.CELL_OVERFLOW,
     Status.CLUSTER_OVERFLOW,
+    Status.ASSIGNMENT_OVERFLOW,
     Status.CANDIDATE_OVERFLOW,
     Status.DETECTION_OVERFLOW,
     Status.HULL_OVERFLOW,
@@ -453,6 +461,7 @@ def _overflow_text(bit: Status, counts: Counts) -> str:
         )
     field, needed = {
         Status.POINT_OVERFLOW: ("PointCloud.from_numpy(capacity=...)", counts.num_points),
+        Status.ASSIGNMENT_OVERFLOW: ("completion.max_assignments", counts.assignments),
         Status.CANDIDATE_OVERFLOW: ("vehicles.max_candidates", counts.candidates),
         Status.DETECTION_OVERFLOW: ("vehicles.max_detections", counts.detections),
         Status.HULL_OVERFLOW: ("hull.max_vertices", counts.hull_vertices),

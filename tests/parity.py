@@ -173,7 +173,7 @@ def complete(proposal, angle, prior, evidence, mode="evidence"):
         evidence=evidence,
         mode=mode,
         **select_options(prior, "length_m", "width_m", "max_length_m", "max_width_m"),
-        **all_options(CONFIG.completion, "mode", "num_final_rays", "along_scene"),
+        **all_options(CONFIG.completion, "mode", "num_final_rays", "along_scene", "max_assignments"),
     )
 
 

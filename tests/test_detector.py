@@ -220,6 +220,24 @@ def test_only_an_accelerator_takes_a_batch_at_once_and_not_where_scatters_are_or
     np.testing.assert_array_equal(found, a - b if together else a + b)
 
 
+def test_assignments_beyond_their_capacity_are_counted_and_the_largest_clusters_are_kept():
+    full, few = found(0), 24
+    completion = dataclasses.replace(DetectorConfig().completion, max_assignments=few)
+    cut = run(street(0).xyz, config=dataclasses.replace(DetectorConfig(), completion=completion))
+    needed = int(full.counts.assignments)
+    assert int(full.status) == 0
+    assert few < needed == int(cut.counts.assignments) < DetectorConfig().completion.max_assignments
+    assert Status(int(cut.status)) == Status.ASSIGNMENT_OVERFLOW
+    with pytest.raises(RuntimeError, match=rf"completion\.max_assignments must be at least {needed}\."):
+        cut.raise_if_failed()
+    # Boxes that are still found are those of before, and none of them has fewer points than one that is lost.
+    again = {tuple(box) for box in rectangles(cut).tolist()}
+    points = np.array(full.num_points[full.valid])
+    kept = np.array([tuple(box) in again for box in rectangles(full).tolist()])
+    assert 0 < kept.sum() < len(kept)
+    assert points[kept].min() > np.median(points[~kept])
+
+
 # The same boxes.
 
 TURNS = {

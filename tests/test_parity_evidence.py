@@ -41,7 +41,7 @@ def complete(readings, points, seen, number):
     """Every cluster tried as one class."""
     cluster = jnp.arange(parity.MAX_CLUSTERS)
     trials = Trials(cluster, jnp.full_like(cluster, number), points.start.shape[0])
-    return complete_trials(trials, readings, points, seen, parity.CONFIG)
+    return complete_trials(trials, readings, points, seen, parity.CONFIG)[0]
 
 
 def random_boxes(count, rng):

@@ -194,6 +194,21 @@ def complete_box(
     return answer(*trials[best], float(objective[best]))
 
 
+def count_assignments(rectangles: list[Reading], max_length_m: float, max_width_m: float) -> int:
+    """Sides of the rectangles that may be the length of a class; those at one rotation count once.
+
+    Args:
+      rectangles: of a cluster.
+      max_length_m: no such vehicle measures longer.
+      max_width_m: no such vehicle measures wider.
+
+    Returns:
+      None to two a rectangle.
+    """
+    ways = [way for r in {r.angle: r for r in rectangles}.values() for way in _ways(r)]
+    return sum(way.length <= max_length_m and way.width <= max_width_m for way in ways)
+
+
 def boxes_away(
     rectangle: Reading, *, max_length_m: float, max_width_m: float, **sides: float
 ) -> list[CompletedBox]:

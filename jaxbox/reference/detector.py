@@ -115,7 +115,7 @@ def detect(xyz: np.ndarray, config: DetectorConfig | None = None, seed: int = 0)
     maps = [find_clusters(obstacles, component_map, settings) for component_map in settings.clustering.maps]
     proposals = [make_proposals(obstacles, slot, settings) for _, slot, _ in maps]
     evidence = _evidence(xyz[inlier], height[inlier], ground, settings)
-    candidates = judge_candidates(proposals, obstacles, evidence, settings)
+    candidates, num_assignments = judge_candidates(proposals, obstacles, evidence, settings)
     best = candidates[: settings.vehicles.max_candidates]
     boxes = np.array([candidate.completed.box for candidate in best]).reshape(-1, 5)
     scores = np.array([candidate.score for candidate in best])
@@ -132,6 +132,7 @@ def detect(xyz: np.ndarray, config: DetectorConfig | None = None, seed: int = 0)
         **_cluster_counts(obstacles, maps, settings),
         "large_clusters": sum(is_large(p, settings) for of_map in proposals for p in of_map),
         "obstacles": len(obstacle_rows),
+        "assignments": num_assignments,
         "candidates": len(candidates),
         "detections": len(rows),
     }

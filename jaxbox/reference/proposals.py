@@ -22,6 +22,7 @@ from jaxbox.reference.completion import (
     Reading,
     boxes_away,
     complete_box,
+    count_assignments,
     direction_preference,
     scene_direction,
 )
@@ -259,7 +260,7 @@ def _preference(proposals: list[Proposal], evidence: Evidence | None, settings: 
 
 def judge_candidates(
     proposals: list[list[Proposal]], obstacles: Obstacles, evidence: Evidence | None, settings: Any
-) -> list[Candidate]:
+) -> tuple[list[Candidate], int]:
     """Scores every proposal as a car, and the high ones as a van and as a truck too.
 
     Args:
@@ -269,14 +270,14 @@ def judge_candidates(
       settings: of the detector.
 
     Returns:
-      What scores more than the least score, best first.
+      What scores more than the least score, best first; how many assignments the evidence had to weigh.
     """
     vehicles = settings.vehicles
     preference = _preference(proposals[0], evidence, settings)
     along_scene = settings.box.scene_direction and settings.completion.along_scene
     every = [proposal for of_map in proposals for proposal in of_map]
     large = [p for p in every if is_large(p, settings)][: vehicles.max_large]
-    candidates = []
+    candidates, num_assignments = [], 0
     for label, chosen in ((Label.CAR, every), (Label.VAN, large), (Label.TRUCK, large)):
         prior = vehicles.classes[label]
         for proposal in chosen:
@@ -285,6 +286,8 @@ def judge_candidates(
                 continue
             if along_scene:
                 readings.append(_reading(proposal, preference, INSISTENCE))
+            if settings.completion.mode == "evidence":
+                num_assignments += count_assignments(readings, prior.max_length_m, prior.max_width_m)
             completed = _complete(proposal, readings, prior, evidence, settings)
             if completed is not None:
                 judged = _judge(
@@ -292,7 +295,7 @@ def judge_candidates(
                 )
                 candidates.append(judged)
     candidates = [c for c in candidates if c.score > vehicles.min_score]
-    return sorted(candidates, key=lambda c: -c.score)
+    return sorted(candidates, key=lambda c: -c.score), num_assignments
 
 
 def _is_tall(proposal: Proposal, reading: Reading, settings: Any) -> bool:

@@ -31,6 +31,7 @@ def conclude(
     proposals: Proposals,
     fits: Fits,
     candidates: Candidates,
+    num_assignments: jax.Array,
     config: DetectorConfig,
 ) -> Detections:
     """Suppresses overlapping boxes, describes the points of the others, and counts everything."""
@@ -45,7 +46,7 @@ def conclude(
     points = _count_points(sweep, heights, proposals, config)
 
     def account() -> tuple[Counts, jax.Array]:
-        counts = _counts(points, cloud, obstacles, proposals, candidates, num, largest_hull)
+        counts = _counts(points, cloud, obstacles, proposals, num_assignments, candidates, num, largest_hull)
         return counts, _status(cloud, counts, heights, config)
 
     counts, status = at_once(account)
@@ -188,6 +189,7 @@ def _counts(
     cloud: PointCloud,
     obstacles: Obstacles,
     proposals: Proposals,
+    num_assignments: jax.Array,
     candidates: Candidates,
     num_detections: jax.Array,
     largest_hull: jax.Array,
@@ -209,6 +211,7 @@ def _counts(
         cells=proposals.num_runs,
         clusters=proposals.num_found,
         large_clusters=proposals.num_large,
+        assignments=num_assignments,
         candidates=candidates.num,
         detections=num_detections,
         hull_vertices=largest_hull,
@@ -230,6 +233,7 @@ def _status(cloud: PointCloud, counts: Counts, heights: Heights, config: Detecto
         Status.CELL_OVERFLOW: jnp.any(counts.cells > max_cells),
         Status.CLUSTER_OVERFLOW: jnp.any(counts.clusters > max_clusters)
         | (counts.large_clusters > settings.max_large),
+        Status.ASSIGNMENT_OVERFLOW: counts.assignments > config.completion.max_assignments,
         Status.CANDIDATE_OVERFLOW: counts.candidates > settings.max_candidates,
         Status.DETECTION_OVERFLOW: counts.detections > settings.max_detections,
         Status.HULL_OVERFLOW: counts.hull_vertices > config.hull.max_vertices,

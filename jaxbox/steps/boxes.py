@@ -154,8 +154,11 @@ def build_evidence(sweep: Sweep, heights: Heights, config: DetectorConfig) -> ev
 
 def complete_boxes(
     fits: Fits, proposals: Proposals, seen: evidence.Evidence | None, config: DetectorConfig
-) -> tuple[Trials, Boxes]:
-    """The completed box of every trial, with the scene's direction preferred where the preset asks."""
+) -> tuple[Trials, Boxes, jax.Array]:
+    """The completed box of every trial, with the scene's direction preferred where the preset asks.
+
+    Last, how many assignments the evidence had to weigh, which completion.max_assignments must hold.
+    """
     preference = jnp.zeros(config.box.num_angles)
     if config.box.scene_direction and seen is not None:
         preference = _scene_preference(fits, proposals, seen, config)
@@ -163,7 +166,7 @@ def complete_boxes(
     if config.box.scene_direction and config.completion.along_scene:
         readings.append(best_rectangles(fits, proposals.num_clusters, preference, INSISTENCE))
     trials = list_trials(proposals, readings, config)
-    return trials, complete_trials(trials, readings, fits.points, seen, config)
+    return trials, *complete_trials(trials, readings, fits.points, seen, config)
 
 
 def _scene_preference(
@@ -222,8 +225,11 @@ def complete_trials(
     points: box.PointLists,
     seen: evidence.Evidence | None,
     config: DetectorConfig,
-) -> Boxes:
-    """The box (Q,) of each trial that there is, of those that the readings of its cluster allow."""
+) -> tuple[Boxes, jax.Array]:
+    """The box (Q,) of each trial that there is, of those that the readings of its cluster allow.
+
+    And how many assignments the evidence had to weigh.
+    """
     if config.completion.mode == "evidence":
         assert seen is not None  # see check_settings
         return _complete_by_evidence(trials, readings, points, seen, config)
@@ -236,7 +242,7 @@ def complete_trials(
             return completion.keep_measured(longer, **limits)
         return completion.extend_away(longer, **_class_options(label, config), **limits)
 
-    return map_rows(complete, (trials.cluster, trials.label), num_rows=trials.num)
+    return map_rows(complete, (trials.cluster, trials.label), num_rows=trials.num), jnp.int32(0)
 
 
 def _complete_by_evidence(
@@ -245,8 +251,8 @@ def _complete_by_evidence(
     points: box.PointLists,
     seen: evidence.Evidence,
     config: DetectorConfig,
-) -> Boxes:
-    placement, objective = _judge_ways(trials, readings, points, seen, config)
+) -> tuple[Boxes, jax.Array]:
+    placement, objective, num_assignments = _judge_ways(trials, readings, points, seen, config)
 
     def complete(of_trial: tuple[jax.Array, ...]) -> Boxes:
         cluster, label, placement, objective = of_trial
@@ -258,7 +264,8 @@ def _complete_by_evidence(
         sizes = completion.likely_sizes(way, **_class_options(label, config))
         return completion.place(way, sizes, placement, objective)
 
-    return map_rows(complete, (trials.cluster, trials.label, placement, objective), num_rows=trials.num)
+    rows = trials.cluster, trials.label, placement, objective
+    return map_rows(complete, rows, num_rows=trials.num), num_assignments
 
 
 def _way(readings: Sequence[Rectangles], way: jax.Array, cluster: jax.Array) -> completion.Ways:
@@ -276,11 +283,12 @@ def _judge_ways(
     points: box.PointLists,
     seen: evidence.Evidence,
     config: DetectorConfig,
-) -> tuple[jax.Array, jax.Array]:
-    """The best placement of each way of each trial, and its J: (Q, W) each."""
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The best placement of each way of each trial, and its J: (Q, W) each; how many ways are possible."""
     settings = config.completion
     num_ways = completion.NUM_WAYS * len(readings)
     entry, num = _largest_first(trials, readings, points, config)
+    num_entries, entry = entry.shape[0], entry[: settings.max_assignments]
 
     def prepare(entry: jax.Array) -> tuple[completion.Hypotheses, jax.Array, jax.Array]:
         trial, number = split_index(entry, num_ways)
@@ -309,10 +317,10 @@ def _judge_ways(
 
     prepared = map_rows(prepare, entry, num_rows=num)
     judged = map_rows(judge, prepared, num_rows=num, chunk=PROPOSAL_CHUNK)
-    nothing = jnp.zeros(entry.shape, jnp.int32), jnp.full(entry.shape, NOT_A_BOX)
-    of_entry = fold_rows(note, nothing, (entry, *judged), num_rows=num, absent=(entry.size, 0, 0.0))
+    nothing = jnp.zeros(num_entries, jnp.int32), jnp.full(num_entries, NOT_A_BOX)
+    of_entry = fold_rows(note, nothing, (entry, *judged), num_rows=num, absent=(num_entries, 0, 0.0))
     placement, objective = (a.reshape(-1, num_ways) for a in of_entry)
-    return placement, objective
+    return placement, objective, num
 
 
 def _largest_first(
