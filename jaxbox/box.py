@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbox.devices import on_accelerator
 from jaxbox.grouping import sort_by_group
 from jaxbox.loops import fast_max, fast_min, fold_points, fold_rows, map_rows, store
 from jaxbox.masked import rows_in_use, take
@@ -60,12 +61,21 @@ class PointLists:
           The points, in their order; those beyond the count may be anything finite.
         """
         start, total = take(self.start, cluster), take(self.total, cluster)
-        j = jnp.arange(self.max_points)[:, None]
-        spread = j * (total // self.max_points) + j * (total % self.max_points) // self.max_points
-        # Stored, since what a look-up has to work out first does not vectorise.
-        row = store(start + jnp.where(total > self.max_points, spread, j))
-        x, y = (jnp.take(values, row, mode="clip") for values in (self.x, self.y))
+        if on_accelerator():
+            # Cluster by cluster, as the points lie in the lists and as `fold_points` reads them there.
+            row = self._row(start[:, None], total[:, None], jnp.arange(self.max_points))
+            xy = jnp.take(jnp.stack([self.x, self.y], axis=1), row, axis=0, mode="clip")
+            x, y = xy[:, :, 0].T, xy[:, :, 1].T
+        else:
+            # Stored, since what a look-up has to work out first does not vectorise.
+            row = store(self._row(start, total, jnp.arange(self.max_points)[:, None]))
+            x, y = (jnp.take(values, row, mode="clip") for values in (self.x, self.y))
         return x, y, jnp.minimum(total, self.max_points)
+
+    def _row(self, start: jax.Array, total: jax.Array, j: jax.Array) -> jax.Array:
+        """The row of the j-th point that is looked at of each cluster."""
+        spread = j * (total // self.max_points) + j * (total % self.max_points) // self.max_points
+        return start + jnp.where(total > self.max_points, spread, j)
 
 
 def list_points(
@@ -95,8 +105,16 @@ def list_points(
         x, y = (values.at[row[i]].get(mode="promise_in_bounds") for values in columns)
         return x, y
 
+    def read_pair(i: jax.Array) -> jax.Array:
+        return jnp.take(xy, row[i], axis=0, mode="clip")
+
     columns = xy[:, 0], xy[:, 1]
-    (x, y), begin, end = sort_by_group(read, cluster, num_entries, num_clusters)
+    if on_accelerator():
+        # In pairs, as `PointLists.table` looks them up.
+        pairs, begin, end = sort_by_group(read_pair, cluster, num_entries, num_clusters)
+        x, y = pairs[:, 0], pairs[:, 1]
+    else:
+        (x, y), begin, end = sort_by_group(read, cluster, num_entries, num_clusters)
     return PointLists(x, y, begin, end - begin, max_points)
 
 

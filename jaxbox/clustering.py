@@ -108,7 +108,12 @@ class CellRow:
         ]
 
     def flag(self, cell: jax.Array) -> jax.Array:
-        """Where the flag of a cell lies: cell c of all strips side by side, so that packing adds up rows."""
+        """Where the flag of a cell lies: cell c of all strips side by side, so that packing adds up rows.
+
+        On an accelerator the flags lie as the cells do: there a sum over neighbours is the faster one.
+        """
+        if on_accelerator():
+            return cell
         return (cell & (STRIP - 1)) * self.num_strips + (cell >> STRIP_SHIFT)
 
 
@@ -242,6 +247,9 @@ def label_components(flags: jax.Array, row: CellRow, *, max_runs: int) -> Compon
 
 def _pack(flags: jax.Array, num_strips: int) -> jax.Array:
     """(R, S) uint32 words of the flags: word r of strip s holds cells r WORD_BITS and on of that strip."""
+    if on_accelerator():
+        bits = flags.reshape(num_strips, STRIP_WORDS, WORD_BITS).astype(jnp.uint32)
+        return jnp.sum(bits << jnp.arange(WORD_BITS, dtype=jnp.uint32), axis=2, dtype=jnp.uint32).T
     bit = jnp.arange(WORD_BITS, dtype=jnp.uint32)[:, None]
     rows = flags.reshape(STRIP_WORDS, WORD_BITS, num_strips).astype(jnp.uint32)
     return jnp.sum(rows << bit, axis=1, dtype=jnp.uint32)

@@ -156,8 +156,8 @@ def build_evidence(
     first = jnp.minimum((first_m / range_cell_m).astype(jnp.int32) + 1, num_ranges)
     last = jnp.minimum((last_m / range_cell_m).astype(jnp.int32), num_ranges)
     is_free = downward & (last_m > first_m) & (last > first)
-    beams = jnp.zeros(size, jnp.int32).at[place(is_free, first)].add(1, mode="drop")
-    beams = beams.at[place(is_free, last)].add(-1, mode="drop")
+    ends = jnp.stack([place(is_free, first), place(is_free, last)])
+    beams = jnp.zeros(size, jnp.int32).at[ends].add(jnp.array([[1], [-1]]), mode="drop")
 
     shape = (num_blocks, BLOCK, num_azimuths)
     return Evidence(
@@ -316,10 +316,13 @@ def cast_rays(
     length, width, yaw = (jnp.broadcast_to(a, shape).reshape(-1) for a in (length, width, yaw))
     # Stored, or what is the same for all rays of a box would be worked out for each.
     fan = store(_ray_fan(center.reshape(-1, 2), length / 2, width / 2, yaw))
-    azimuth, enter, leave = store(_ray_stretches(fan, num_rays))
+    # The axis along which the rays of a box lie: on a CPU sums along the first vectorise, on an accelerator
+    # those along the last are the faster ones.
+    axis = 1 if on_accelerator() else 0
+    azimuth, enter, leave = store(_ray_stretches(fan, num_rays, axis))
     met = store(_sort_rays(evidence, azimuth, enter, leave, range_cell_m))
     # Sums of integers take several kernels, those of floats one (XLA, CPU), and these are exact.
-    sums = (jnp.sum(a, axis=0, dtype=jnp.float32).reshape(shape) for a in met)
+    sums = (jnp.sum(a, axis=axis, dtype=jnp.float32).reshape(shape) for a in met)
     hit, free, deep, crosses, free_cells, cells = sums
     total = jnp.maximum(crosses, 1)
     return RayFractions(
@@ -350,15 +353,16 @@ def _ray_fan(center: jax.Array, half_l: jax.Array, half_w: jax.Array, yaw: jax.A
     return azimuth, (high - low) / 2, along, across, u, v, half_l, half_w
 
 
-def _ray_stretches(fan: Fan, num_rays: int) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Azimuth of rays over boxes, and the ranges at which they enter and leave, each (num_rays, boxes).
+def _ray_stretches(fan: Fan, num_rays: int, axis: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Azimuth of rays over boxes, and the ranges at which they enter and leave, the rays along an axis.
 
     In the box's frame, with the sensor at the origin, the box is |u - u0| < l / 2 and |v - v0| < w / 2: the
     slab test. A ray that leaves before it enters misses.
     """
-    middle, half, along, across, u0, v0, half_l, half_w = fan
+    middle, half, along, across, u0, v0, half_l, half_w = (jnp.expand_dims(a, axis) for a in fan)
     # A quarter turn at most, as seen from outside the box; from inside, any direction leads out.
-    offset = ((2 * jnp.arange(num_rays) + 1) / num_rays - 1)[:, None] * half
+    share = (2 * jnp.arange(num_rays) + 1) / num_rays - 1
+    offset = jnp.expand_dims(share, 1 - axis) * half
     cos, sin = _cos_sin(offset)
     enter_u, leave_u = _slab(u0, along * cos - across * sin, half_l)
     enter_v, leave_v = _slab(v0, across * cos + along * sin, half_w)

@@ -17,6 +17,9 @@ from jaxbox.types import GroundPlane
 HYPOTHESES_AT_A_TIME = 32
 """Planes tried together: few enough for their residuals to stay in the cache."""
 
+MIN_SPREAD = 1e-4
+"""Least determinant of the inliers' covariance, over the square of its trace, that tells a plane."""
+
 FAR_FILL_WIDTH = 4
 """How much wider the wide Gaussian is, which fills where the narrow one has no ground cell."""
 
@@ -262,6 +265,8 @@ def _is_level(plane: jax.Array, max_grade: jax.Array) -> jax.Array:
 
 def _refit(candidates: jax.Array, inliers: jax.Array, plane: jax.Array) -> jax.Array:
     """Least-squares plane through the inliers, about their mean: float32 sums would cancel else."""
+    if on_accelerator():
+        return _refit_residuals(candidates, inliers, plane)
     rows = candidates.T
     num = jnp.maximum(count(inliers), 1).astype(jnp.float32)
     mean = jnp.sum(jnp.where(inliers, rows, 0), axis=1) / num
@@ -272,8 +277,24 @@ def _refit(candidates: jax.Array, inliers: jax.Array, plane: jax.Array) -> jax.A
     b = (cov[1, 2] * cov[0, 0] - cov[0, 2] * cov[0, 1]) / determinant
     refit = jnp.stack([a, b, mean[2] - a * mean[0] - b * mean[1]])
     # Inliers on one line leave the plane open: keep the one that they came from.
-    spread = determinant > 1e-4 * (cov[0, 0] + cov[1, 1]) ** 2
+    spread = determinant > MIN_SPREAD * (cov[0, 0] + cov[1, 1]) ** 2
     return jnp.where(spread, refit, plane)
+
+
+def _refit_residuals(candidates: jax.Array, inliers: jax.Array, plane: jax.Array) -> jax.Array:
+    """As `_refit`, by one sum of all moments: of the residuals, which are small, none cancels."""
+    x, y = candidates[:, 0], candidates[:, 1]
+    r = plane_residual(candidates, plane)
+    moments = jnp.stack([jnp.ones_like(x), x, y, r, x * x, x * y, y * y, x * r, y * r])
+    num, *sums = jnp.sum(jnp.where(inliers, moments, 0), axis=1)
+    mean_x, mean_y, mean_r, xx, xy, yy, xr, yr = (total / jnp.maximum(num, 1) for total in sums)
+    xx, xy, yy = xx - mean_x**2, xy - mean_x * mean_y, yy - mean_y**2
+    xr, yr = xr - mean_x * mean_r, yr - mean_y * mean_r
+    determinant = xx * yy - xy**2
+    a, b = (xr * yy - yr * xy) / determinant, (yr * xx - xr * xy) / determinant
+    change = jnp.stack([a, b, mean_r - a * mean_x - b * mean_y])
+    spread = determinant > MIN_SPREAD * (xx + yy) ** 2
+    return plane + jnp.where(spread, change, 0)
 
 
 def fit_ground_surface(

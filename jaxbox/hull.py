@@ -196,20 +196,21 @@ def _lower_hulls_at_once(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Arr
     """As `_lower_hulls`, by all pairs of points, which is one kernel on an accelerator.
 
     A point is a vertex where the steepest way to it from the left is less steep than the flattest way on to
-    the right, and no point lies below it (of equal ones the first counts).
+    the right. From a point below the way is infinitely steep; of points in one place the first counts.
     """
     far, num_points = jnp.inf, x.shape[0]
     index, row = jnp.arange(num_points)[:, None], jnp.arange(num_points + 1)[:, None]
-    # The points (M, 1, C), held against all others (M, C).
-    at_x, at_y, at_index = x[:, None], y[:, None], index[:, None]
-    to_left, to_right = x < at_x, x > at_x
-    slope = (y - at_y) / jnp.where(to_left | to_right, x - at_x, 1)
-    comes_first = (y < at_y) | ((y == at_y) & (index < at_index))
-    is_lowest = ~jnp.any((x == at_x) & comes_first, axis=1)
-    arriving = jnp.max(jnp.where(to_left, slope, -far), axis=1)
-    leaving = jnp.min(jnp.where(to_right, slope, far), axis=1)
-    is_vertex = (x > -far) & is_lowest & (arriving < leaving)
-    place = jnp.sum(is_vertex & to_left, axis=1, dtype=jnp.int32)
+    # The points (M, 1, C), held against all others (M, C). Each reduction over those makes comparisons of its
+    # own, by the places or by the differences: what two of them share would be stored for all pairs.
+    at_x, at_y = x[:, None], y[:, None]
+    is_again = jnp.any((x == at_x) & (y == at_y) & (index < index[:, None]), axis=1)
+    ahead, up = x - at_x, y - at_y
+    slope = up / ahead  # Not a number only where it is not taken.
+    steepest = jnp.where((ahead == 0) & (up < 0), far, -far)
+    arriving = jnp.max(jnp.where(ahead < 0, slope, steepest), axis=1)
+    leaving = jnp.min(jnp.where(ahead > 0, slope, far), axis=1)
+    is_vertex = (x > -far) & ~is_again & (arriving < leaving)
+    place = jnp.sum(is_vertex & (x < at_x), axis=1, dtype=jnp.int32)
     # Vertex k of each chain, by its place among the vertices.
     is_in_row = is_vertex & (place == row[:, None])
     chain_x, chain_y = (jnp.max(jnp.where(is_in_row, values, -far), axis=1) for values in (x, y))

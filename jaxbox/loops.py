@@ -101,7 +101,8 @@ def for_chunks(
     """Calls a step with each chunk of the rows that count, one after the other.
 
     The loop counts rows and not chunks, and without a sign: to divide, to multiply, and to look whether an
-    index counts from the end would be a kernel each (XLA, CPU).
+    index counts from the end would be a kernel each (XLA, CPU). On an accelerator the first chunk is done
+    unasked, since its host waits for each answer: where no row counts, the step must do nothing.
 
     Args:
       num_rows: () int32, how many rows count.
@@ -122,7 +123,8 @@ def for_chunks(
         start, state = loop
         return start + chunk, step(start, state)
 
-    return jax.lax.while_loop(more, turn, (jnp.uint32(0), state))[1]
+    start = jnp.uint32(0), state
+    return jax.lax.while_loop(more, turn, turn(start) if on_accelerator() else start)[1]
 
 
 def map_rows(
@@ -253,26 +255,30 @@ def fold_points(
       count: (C,) int32, points of each cluster.
       init: pytree of (..., C) arrays, the state before the first point.
       update: maps the state and x (C,), y (C,) to the next state.
-      absent: x and y, () or (C,) each, of the points that a cluster does not have: such that `update`
-        makes nothing of them.
+      absent: x and y, () or (C,) each, of the points that a cluster does not have, for a CPU: such that
+        `update` makes nothing of them.
       reduce: static, `jnp.sum` or `jnp.max`, whichever `update` does, and `init` the neutral state of it.
 
     Returns:
       The state after the last point of each cluster.
     """
     capacity = x.shape[0]
-    there = jnp.arange(capacity)[:, None] < count
-    points = jnp.where(there, x, absent[0]), jnp.where(there, y, absent[1])
     if on_accelerator():
-        of_point = jax.vmap(functools.partial(update, init))(*points)
-        return jax.tree.map(functools.partial(reduce, axis=0), of_point)
+        # Points along the last axis, which reductions read without transposing, see `PointLists.table`.
+        of_point = jax.vmap(functools.partial(update, init), out_axes=-1)(x, y)
+        exists = jnp.arange(capacity) < count[:, None]
+        return jax.tree.map(
+            lambda values, none: reduce(jnp.where(exists, values, none[..., None]), axis=-1), of_point, init
+        )
 
-    unroll = FOLD_UNROLL
+    there, unroll = jnp.arange(capacity)[:, None] < count, FOLD_UNROLL
 
     def fill(values: jax.Array, value: Any) -> jax.Array:
-        return jnp.concatenate([values, jnp.broadcast_to(value, (-capacity % unroll, values.shape[1]))])
+        filled = jnp.where(there, values, value)
+        more = jnp.broadcast_to(value, (-capacity % unroll, values.shape[1]))
+        return jnp.concatenate([filled, more])
 
-    filled = fill(points[0], absent[0]), fill(points[1], absent[1])
+    filled = fill(x, absent[0]), fill(y, absent[1])
     most = jnp.minimum(jnp.max(count, initial=0), capacity)
 
     def step(loop: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:

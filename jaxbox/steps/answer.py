@@ -2,12 +2,14 @@
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 
 from jaxbox import descriptors, hull, vehicles
 from jaxbox.config import DetectorConfig
+from jaxbox.devices import on_accelerator
 from jaxbox.loops import at_once, fold_rows, map_rows, store
 from jaxbox.masked import compact, count_true, greatest, lookup, take
 from jaxbox.steps.boxes import Fits, max_slab_points, trace_hulls
@@ -156,23 +158,30 @@ def _owners(
     of_cluster = jnp.full(num_clusters + 1, num_detections).at[kept.cluster].min(rank, mode="drop")
     # No point is inside the box of no detection.
     frame = jnp.pad(kept.frame, ((0, 1), (0, 0)), constant_values=-1)
-    best = functools.reduce(jnp.minimum, [lookup(of_cluster, cluster) for cluster in proposals.cluster])
-    asked, num_asked = compact(store(best < num_detections), best.shape[0], num=obstacles.count)
 
-    def own(index: jax.Array) -> jax.Array:
-        xy = take(obstacles.xy, index)
-        owner = jnp.full(index.shape, num_detections)
-        for cluster in proposals.cluster:
-            detection = lookup(of_cluster, take(cluster, index, num_clusters))
+    def own(xy: jax.Array, clusters: Sequence[jax.Array]) -> jax.Array:
+        owner = jnp.full(xy.shape[0], num_detections)
+        for cluster in clusters:
+            detection = lookup(of_cluster, cluster)
             x, y, cos, sin, half_length, half_width = jnp.take(frame, detection, axis=0, mode="clip").T
             dx, dy = xy[:, 0] - x, xy[:, 1] - y
             inside = jnp.abs(dx * cos + dy * sin) <= half_length
             inside = inside & (jnp.abs(dy * cos - dx * sin) <= half_width)
             owner = jnp.minimum(owner, jnp.where(inside, detection, num_detections))
-        # Look-ups do not vectorise within the write of a chunk (XLA, CPU).
-        return store(owner)
+        return owner
 
-    return asked, map_rows(own, asked, num_rows=num_asked, chunk=OWNER_CHUNK), num_asked
+    if on_accelerator():
+        # To list those that are asked takes longer there than to ask all.
+        return jnp.arange(obstacles.row.shape[0]), own(obstacles.xy, list(proposals.cluster)), obstacles.count
+    best = functools.reduce(jnp.minimum, [lookup(of_cluster, cluster) for cluster in proposals.cluster])
+    asked, num_asked = compact(store(best < num_detections), best.shape[0], num=obstacles.count)
+
+    def own_at(index: jax.Array) -> jax.Array:
+        clusters = [take(cluster, index, num_clusters) for cluster in proposals.cluster]
+        # Look-ups do not vectorise within the write of a chunk (XLA, CPU).
+        return store(own(take(obstacles.xy, index), clusters))
+
+    return asked, map_rows(own_at, asked, num_rows=num_asked, chunk=OWNER_CHUNK), num_asked
 
 
 def _count_points(sweep: Sweep, heights: Heights, proposals: Proposals, config: DetectorConfig) -> jax.Array:

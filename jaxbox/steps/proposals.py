@@ -151,10 +151,9 @@ def _find_cells(
         present = start + jnp.arange(size if on_accelerator() else CHUNK) < obstacles.count
         # Stored, or each map would draw the points together anew.
         xy = store(warp(_chunk(obstacles.xy, start)))
-        for i, cell in enumerate(find(xy, _chunk(obstacles.height, start), present)):
-            flags = flags.at[cells.flag(cell)].set(1, mode="promise_in_bounds")
-            table = _store(table, jnp.uint32(i), start, cell)
-        return table, flags
+        found = jnp.stack(find(xy, _chunk(obstacles.height, start), present))
+        flags = flags.at[cells.flag(found)].set(1, mode="promise_in_bounds")
+        return jax.lax.dynamic_update_slice(table, found, (jnp.uint32(0), start)), flags
 
     table = jnp.zeros((len(maps), size if on_accelerator() else size + -size % CHUNK), jnp.int32)
     return _fold_chunks(step, (table, jnp.zeros(cells.num_flags, jnp.uint8)), obstacles)
