@@ -20,16 +20,16 @@ SETTINGS = parity.CONFIG.box
 CRITERIA = ("area", "variance", "closeness", "visible_closeness")
 NUM_SLICES = parity.CONFIG.hull.num_slices
 MAX_VERTICES = 128
-MAX_FITS = 4096
+MAX_FITS = 1024
 """Rows for the clusters of all cases of a kind."""
 
 
-@jax.jit
+@parity.PerForm
 def find_bounds(*rows):
     return hull.find_bounds(*rows, num_clusters=parity.MAX_CLUSTERS)
 
 
-@jax.jit
+@parity.PerForm
 def extreme_points(*rows):
     return hull.extreme_points(*rows, *find_bounds(*rows), num_slices=NUM_SLICES)
 
@@ -40,16 +40,16 @@ def trace_hulls(points, valid):
     return jnp.array(vertices).T, count
 
 
-@jax.jit
+@parity.PerForm
 def convex_hulls(points, valid, num_clusters):
     # In chunks, or the work would be that of all rows.
     return map_rows(lambda rows: trace_hulls(*rows), (points, valid), num_rows=num_clusters, chunk=16)
 
 
 polygon_area = jax.jit(hull.polygon_area)
-try_rotations = jax.jit(box.try_rotations, static_argnames=("criterion", "num_angles"))
-scene_preference = jax.jit(box.scene_preference, static_argnames="num_angles")
-point_moments = jax.jit(descriptors.point_moments)
+try_rotations = parity.PerForm(box.try_rotations, static_argnames=("criterion", "num_angles"))
+scene_preference = parity.PerForm(box.scene_preference, static_argnames="num_angles")
+point_moments = parity.PerForm(descriptors.point_moments)
 shape_descriptors = jax.jit(descriptors.shape_descriptors)
 
 
@@ -100,6 +100,7 @@ def assert_same_hull(vertices, expected, what):
             parity.assert_within(distance_to_outline(np.array(list(extra)), polygon), 1e-4, f"vertex {what}")
 
 
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("size", [3, 10, 128])
 def test_hulls_of_random_points_are_those_of_opencv(size):
     clouds = random_clouds(400, size)
@@ -113,6 +114,7 @@ def test_hulls_of_random_points_are_those_of_opencv(size):
         )
 
 
+@pytest.mark.usefixtures("platform")
 def test_hulls_of_no_point_of_one_and_of_two_are_those_points():
     points = np.array([[[5, 7], [5, 7], [9, 8]]] * 3, np.float32)
     valid = np.array([[False] * 3, [True, True, False], [True] * 3])
@@ -123,6 +125,7 @@ def test_hulls_of_no_point_of_one_and_of_two_are_those_points():
     np.testing.assert_array_equal(vertices[2, :2], [[5, 7], [9, 8]])
 
 
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("garbage", [np.nan, np.inf, -np.inf])
 def test_what_absent_points_hold_does_not_reach_a_hull(garbage):
     clouds = random_clouds(4, 10)
@@ -134,6 +137,7 @@ def test_what_absent_points_hold_does_not_reach_a_hull(garbage):
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.usefixtures("platform")
 def test_hulls_of_clusters_are_those_of_opencv(cases):
     for case in cases:
         points, count = parity.padded_points([case])
@@ -149,6 +153,7 @@ def test_hulls_of_clusters_are_those_of_opencv(cases):
                 assert abs(reference.signed_area(ours.astype(float)) - reference.signed_area(expected)) < 1e-3
 
 
+@pytest.mark.usefixtures("platform")
 def test_extreme_points_lose_at_most_a_slice_of_the_hull(cases):
     for case in cases:
         xy = case.obstacles.xyz[:, :2].astype(np.float32)
@@ -172,6 +177,7 @@ def test_extreme_points_lose_at_most_a_slice_of_the_hull(cases):
             parity.assert_within(np.append(far, 0) / bound, 1, "of the bound of a slice")
 
 
+@pytest.mark.usefixtures("platform")
 def test_what_a_list_holds_beyond_its_end_joins_no_cluster():
     rng = np.random.default_rng(0)
     size, num = hull.CHUNK_POINTS + 900, hull.CHUNK_POINTS + 300
@@ -192,8 +198,8 @@ def test_what_a_list_holds_beyond_its_end_joins_no_cluster():
 
 def test_a_cpu_describes_clusters_in_native_loops():
     rows = jnp.zeros(900, jnp.int32), jnp.zeros(900, jnp.int32), jnp.int32(9), jnp.zeros((1000, 2))
-    assert count_loops(find_bounds, *rows) == (1, 1)
-    assert count_loops(point_moments, *rows, jnp.zeros((parity.MAX_CLUSTERS, 2))) == (1, 1)
+    assert count_loops(find_bounds.jitted, *rows) == (1, 1)
+    assert count_loops(point_moments.jitted, *rows, jnp.zeros((parity.MAX_CLUSTERS, 2))) == (1, 1)
 
 
 def fits_of(cases):
@@ -202,6 +208,7 @@ def fits_of(cases):
     return points, count, (lists, jnp.arange(MAX_FITS), np.int32(len(count)))
 
 
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("criterion", CRITERIA)
 def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, criterion):
     options = {"num_angles": SETTINGS.num_angles, "min_distance_m": SETTINGS.min_distance_m}
@@ -227,6 +234,7 @@ def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, cr
     parity.assert_share(worse, len(count), 2e-3, f"best {criterion}")
 
 
+@pytest.mark.usefixtures("platform")
 def test_smallest_area_is_that_of_opencv_within_the_bound_of_the_step(cases):
     points, count, fits = fits_of(cases)
     curve, _ = try_rotations(*fits, criterion="area", num_angles=SETTINGS.num_angles, min_distance_m=0.05)
@@ -239,6 +247,7 @@ def test_smallest_area_is_that_of_opencv_within_the_bound_of_the_step(cases):
         assert length * width - 1e-3 <= area <= length * width + bound + 1e-3
 
 
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("criterion", CRITERIA)
 def test_a_cluster_without_points_has_no_extents_and_a_finite_curve(criterion):
     x, y = jnp.array([1.0, 2, 3]), jnp.array([1.0, 1, 2])
@@ -251,6 +260,7 @@ def test_a_cluster_without_points_has_no_extents_and_a_finite_curve(criterion):
     np.testing.assert_array_equal(np.stack(extents)[:, :, 1], 0)
 
 
+@pytest.mark.usefixtures("platform")
 def test_scene_direction_is_that_of_the_reference():
     rng = np.random.default_rng(0)
     options = {"num_angles": 90, "sigma_deg": SETTINGS.direction_sigma_deg}
@@ -288,6 +298,7 @@ def test_scene_direction_of_sweeps_is_that_of_the_reference(cases):
         assert direction == np.argmax(preference)
 
 
+@pytest.mark.usefixtures("platform")
 def test_descriptors_are_those_of_the_reference(cases):
     for case in cases:
         xy = case.obstacles.xyz[:, :2].astype(np.float32)
@@ -332,6 +343,7 @@ def test_descriptors_of_a_rectangle_a_point_and_none_are_those_worked_by_hand():
     np.testing.assert_allclose(found.complexity, [1, 1, 0])
 
 
+@pytest.mark.usefixtures("platform")
 def test_a_hull_beyond_its_capacity_is_fitted_to_by_its_own_vertices():
     config = dataclasses.replace(DetectorConfig.paper(), hull=HullConfig(max_vertices=4))
     angle = np.arange(40) * (2 * np.pi / 40)
