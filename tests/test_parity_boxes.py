@@ -1,6 +1,7 @@
 """Parity with the reference and OpenCV: hulls, rectangles, the scene's direction, descriptors."""
 
 import dataclasses
+import functools
 import math
 import types
 
@@ -38,6 +39,10 @@ def trace_hulls(points, valid):
     """Hulls (C, H, 2) of clusters (C, M, 2)."""
     *vertices, count = hull.convex_hulls(*points.T, valid.T, max_vertices=MAX_VERTICES)
     return jnp.array(vertices).T, count
+
+
+trace = parity.PerForm(trace_hulls)
+few_vertices = parity.PerForm(functools.partial(hull.convex_hulls, max_vertices=7))
 
 
 @parity.PerForm
@@ -123,6 +128,76 @@ def test_hulls_of_no_point_of_one_and_of_two_are_those_points():
     np.testing.assert_array_equal(vertices[0], np.zeros((MAX_VERTICES, 2)))
     np.testing.assert_array_equal(vertices[1], np.full((MAX_VERTICES, 2), [5, 7]))
     np.testing.assert_array_equal(vertices[2, :2], [[5, 7], [9, 8]])
+
+
+def strict_hull(points):
+    """Vertices of the hull of whole numbers (n, 2), from the leftmost and lowest point on; none on an edge.
+
+    Andrew's monotone chain, in whole numbers.
+    """
+    points = sorted(set(map(tuple, points.tolist())))
+
+    def chain(points):
+        kept = []
+        for x, y in points:
+            while len(kept) > 1:
+                (ax, ay), (bx, by) = kept[-2:]
+                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
+                    break
+                kept.pop()
+            kept.append((x, y))
+        return kept[:-1]
+
+    return points if len(points) < 2 else chain(points) + chain(points[::-1])
+
+
+def whole_clusters(size=60):
+    """Points of whole numbers (K, size, 2) of every awkward kind, and which are there: all, some, few."""
+    rng, k = np.random.default_rng(0), np.arange(size)
+    kinds = [
+        np.zeros((size, 2)),
+        np.stack([k, 0 * k], axis=1),
+        np.stack([0 * k, k], axis=1),
+        np.stack([k - 7, -k], axis=1),
+        np.stack([3 * k, k], axis=1)[::-1],
+        np.stack([k % 5, k // 5 % 5], axis=1),
+        np.stack([k % 2, k % 3], axis=1),
+        np.stack([k, k**2], axis=1),
+        np.stack([np.rint(900 * np.cos(k)), np.rint(900 * np.sin(k))], axis=1),
+    ]
+    kinds += [rng.integers(-reach, reach + 1, (size, 2)) for reach in (1, 2, 3, 9, 50) for _ in range(6)]
+    points = np.stack(kinds * 3)
+    valid = np.ones(points.shape[:2], bool)
+    valid[len(kinds) :] = rng.random(valid[len(kinds) :].shape) < 0.6
+    valid[2 * len(kinds) :] &= rng.random(valid[2 * len(kinds) :].shape) < 0.05
+    assert {0, 1, 2, 3} < set(valid.sum(axis=1))
+    return points.astype(np.int64), valid
+
+
+@pytest.mark.usefixtures("platform")
+def test_hulls_of_whole_numbers_are_exact_and_begin_at_the_leftmost_point():
+    points, valid = whole_clusters()
+    vertices, num = trace(points.astype(np.float32), valid)
+    for xy, ours, count in zip(
+        [p[v] for p, v in zip(points, valid, strict=True)], vertices, num, strict=True
+    ):
+        expected = np.array(strict_hull(xy)).reshape(-1, 2)
+        assert count == len(expected)
+        np.testing.assert_array_equal(ours[:count], expected)
+        last = expected[-1] if count else np.zeros(2)
+        np.testing.assert_array_equal(ours[count:], np.tile(last, (MAX_VERTICES - count, 1)))
+
+
+@pytest.mark.usefixtures("platform")
+def test_a_hull_beyond_its_capacity_keeps_every_so_many_of_its_vertices():
+    points, valid = whole_clusters()
+    x, y = points.astype(np.float32).T
+    *few, num = few_vertices(x, y, valid.T)
+    every, _ = map(np.asarray, trace(points.astype(np.float32), valid))
+    assert (np.asarray(num) > 7).sum() > 5
+    for k in np.flatnonzero(np.asarray(num) > 7):
+        pick = np.arange(7) * int(num[k]) // 7
+        np.testing.assert_array_equal(np.array(few)[:, :, k].T, every[k, pick])
 
 
 @pytest.mark.usefixtures("platform")
