@@ -61,7 +61,8 @@ def cases(request: pytest.FixtureRequest) -> tuple[parity.Case, ...]:
 def platform(request, monkeypatch):
     """Either form of what is done otherwise on a CPU, whatever the tests run on.
 
-    Functions that were jitted before would keep the form that they were traced in: a test jits its own.
+    Functions that were jitted before would keep the form that they were traced in: a test jits its own, or
+    shares one a form, a `parity.PerForm`.
     """
     asked = []
     chosen = devices._for_accelerator
@@ -78,4 +79,4 @@ def platform(request, monkeypatch):
     monkeypatch.setattr(devices, "_for_accelerator", Watched())
     with devices.building_for(accelerator=request.param == "accelerator"):
         yield request.param
-    assert asked, "Traced before: jit a function of the test's own."
+    assert asked, "Traced before: jit a function of the test's own, or a parity.PerForm."

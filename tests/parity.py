@@ -6,12 +6,14 @@ A stage and its reference get the same float32 inputs, so that each answers for 
 import dataclasses
 import functools
 import pathlib
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox import reference, synthetic
+from jaxbox import devices, reference, synthetic
 from jaxbox.box import PointLists
 from jaxbox.config import ComponentMap, DetectorConfig
 from jaxbox.evidence import BLOCK, Evidence, _free_words, _hit_words
@@ -42,6 +44,35 @@ SURFACE = SURFACE_GRID | select_options(
     *("num_envelope_rounds", "max_grade", "band_below_m", "band_below_grade", "band_above_m"),
     *("band_above_grade", "blind_radius_m", "envelope_margin_m", "smoothing_m"),
 )
+
+
+class PerForm:
+    """A function jitted once for each form of what is done otherwise on a CPU, see the fixture `platform`.
+
+    Functions that are jitted at the top of a module would keep the form that they were traced in first.
+    """
+
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+        self.function = function
+        # Two jits of one function would share its traces: so each has a function of its own.
+        self._of_form = [jax.jit(functools.partial(function), **options) for _ in range(2)]
+
+    @property
+    def jitted(self) -> Any:
+        """The jitted function of the form that is asked for in this context."""
+        return self._of_form[devices.on_accelerator()]
+
+    def __call__(self, *args: Any, **named: Any) -> Any:
+        return self.jitted(*args, **named)
+
+
+def in_both_forms(function, *args, **named):
+    """What a function that reads the platform, a `PerForm` say, gives for a CPU and for an accelerator."""
+    results = []
+    for accelerator in (False, True):
+        with devices.building_for(accelerator=accelerator):
+            results.append(on_host(function(*args, **named)))
+    return results
 
 
 def all_options(config, *drop):

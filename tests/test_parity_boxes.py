@@ -1,6 +1,7 @@
 """Parity with the reference and OpenCV: hulls, rectangles, the scene's direction, descriptors."""
 
 import dataclasses
+import functools
 import math
 import types
 
@@ -20,16 +21,16 @@ SETTINGS = parity.CONFIG.box
 CRITERIA = ("area", "variance", "closeness", "visible_closeness")
 NUM_SLICES = parity.CONFIG.hull.num_slices
 MAX_VERTICES = 128
-MAX_FITS = 4096
+MAX_FITS = 1024
 """Rows for the clusters of all cases of a kind."""
 
 
-@jax.jit
+@parity.PerForm
 def find_bounds(*rows):
     return hull.find_bounds(*rows, num_clusters=parity.MAX_CLUSTERS)
 
 
-@jax.jit
+@parity.PerForm
 def extreme_points(*rows):
     return hull.extreme_points(*rows, *find_bounds(*rows), num_slices=NUM_SLICES)
 
@@ -40,16 +41,20 @@ def trace_hulls(points, valid):
     return jnp.array(vertices).T, count
 
 
-@jax.jit
+trace = parity.PerForm(trace_hulls)
+few_vertices = parity.PerForm(functools.partial(hull.convex_hulls, max_vertices=7))
+
+
+@parity.PerForm
 def convex_hulls(points, valid, num_clusters):
     # In chunks, or the work would be that of all rows.
     return map_rows(lambda rows: trace_hulls(*rows), (points, valid), num_rows=num_clusters, chunk=16)
 
 
 polygon_area = jax.jit(hull.polygon_area)
-try_rotations = jax.jit(box.try_rotations, static_argnames=("criterion", "num_angles"))
-scene_preference = jax.jit(box.scene_preference, static_argnames="num_angles")
-point_moments = jax.jit(descriptors.point_moments)
+try_rotations = parity.PerForm(box.try_rotations, static_argnames=("criterion", "num_angles"))
+scene_preference = parity.PerForm(box.scene_preference, static_argnames="num_angles")
+point_moments = parity.PerForm(descriptors.point_moments)
 shape_descriptors = jax.jit(descriptors.shape_descriptors)
 
 
@@ -100,6 +105,7 @@ def assert_same_hull(vertices, expected, what):
             parity.assert_within(distance_to_outline(np.array(list(extra)), polygon), 1e-4, f"vertex {what}")
 
 
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("size", [3, 10, 128])
 def test_hulls_of_random_points_are_those_of_opencv(size):
     clouds = random_clouds(400, size)
@@ -113,6 +119,7 @@ def test_hulls_of_random_points_are_those_of_opencv(size):
         )
 
 
+@pytest.mark.usefixtures("platform")
 def test_hulls_of_no_point_of_one_and_of_two_are_those_points():
     points = np.array([[[5, 7], [5, 7], [9, 8]]] * 3, np.float32)
     valid = np.array([[False] * 3, [True, True, False], [True] * 3])
@@ -123,6 +130,77 @@ def test_hulls_of_no_point_of_one_and_of_two_are_those_points():
     np.testing.assert_array_equal(vertices[2, :2], [[5, 7], [9, 8]])
 
 
+def strict_hull(points):
+    """Vertices of the hull of whole numbers (n, 2), from the leftmost and lowest point on; none on an edge.
+
+    Andrew's monotone chain, in whole numbers.
+    """
+    points = sorted(set(map(tuple, points.tolist())))
+
+    def chain(points):
+        kept = []
+        for x, y in points:
+            while len(kept) > 1:
+                (ax, ay), (bx, by) = kept[-2:]
+                if (bx - ax) * (y - ay) - (by - ay) * (x - ax) > 0:
+                    break
+                kept.pop()
+            kept.append((x, y))
+        return kept[:-1]
+
+    return points if len(points) < 2 else chain(points) + chain(points[::-1])
+
+
+def whole_clusters(size=60):
+    """Points of whole numbers (K, size, 2) of every awkward kind, and which are there: all, some, few."""
+    rng, k = np.random.default_rng(0), np.arange(size)
+    kinds = [
+        np.zeros((size, 2)),
+        np.stack([k, 0 * k], axis=1),
+        np.stack([0 * k, k], axis=1),
+        np.stack([k - 7, -k], axis=1),
+        np.stack([3 * k, k], axis=1)[::-1],
+        np.stack([k % 5, k // 5 % 5], axis=1),
+        np.stack([k % 2, k % 3], axis=1),
+        np.stack([k, k**2], axis=1),
+        np.stack([np.rint(900 * np.cos(k)), np.rint(900 * np.sin(k))], axis=1),
+    ]
+    kinds += [rng.integers(-reach, reach + 1, (size, 2)) for reach in (1, 2, 3, 9, 50) for _ in range(6)]
+    points = np.stack(kinds * 3)
+    valid = np.ones(points.shape[:2], bool)
+    valid[len(kinds) :] = rng.random(valid[len(kinds) :].shape) < 0.6
+    valid[2 * len(kinds) :] &= rng.random(valid[2 * len(kinds) :].shape) < 0.05
+    assert {0, 1, 2, 3} < set(valid.sum(axis=1))
+    return points.astype(np.int64), valid
+
+
+@pytest.mark.usefixtures("platform")
+def test_hulls_of_whole_numbers_are_exact_and_begin_at_the_leftmost_point():
+    points, valid = whole_clusters()
+    vertices, num = trace(points.astype(np.float32), valid)
+    for xy, ours, count in zip(
+        [p[v] for p, v in zip(points, valid, strict=True)], vertices, num, strict=True
+    ):
+        expected = np.array(strict_hull(xy)).reshape(-1, 2)
+        assert count == len(expected)
+        np.testing.assert_array_equal(ours[:count], expected)
+        last = expected[-1] if count else np.zeros(2)
+        np.testing.assert_array_equal(ours[count:], np.tile(last, (MAX_VERTICES - count, 1)))
+
+
+@pytest.mark.usefixtures("platform")
+def test_a_hull_beyond_its_capacity_keeps_every_so_many_of_its_vertices():
+    points, valid = whole_clusters()
+    x, y = points.astype(np.float32).T
+    *few, num = few_vertices(x, y, valid.T)
+    every, _ = map(np.asarray, trace(points.astype(np.float32), valid))
+    assert (np.asarray(num) > 7).sum() > 5
+    for k in np.flatnonzero(np.asarray(num) > 7):
+        pick = np.arange(7) * int(num[k]) // 7
+        np.testing.assert_array_equal(np.array(few)[:, :, k].T, every[k, pick])
+
+
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("garbage", [np.nan, np.inf, -np.inf])
 def test_what_absent_points_hold_does_not_reach_a_hull(garbage):
     clouds = random_clouds(4, 10)
@@ -134,6 +212,7 @@ def test_what_absent_points_hold_does_not_reach_a_hull(garbage):
         np.testing.assert_array_equal(ours, theirs)
 
 
+@pytest.mark.usefixtures("platform")
 def test_hulls_of_clusters_are_those_of_opencv(cases):
     for case in cases:
         points, count = parity.padded_points([case])
@@ -149,6 +228,7 @@ def test_hulls_of_clusters_are_those_of_opencv(cases):
                 assert abs(reference.signed_area(ours.astype(float)) - reference.signed_area(expected)) < 1e-3
 
 
+@pytest.mark.usefixtures("platform")
 def test_extreme_points_lose_at_most_a_slice_of_the_hull(cases):
     for case in cases:
         xy = case.obstacles.xyz[:, :2].astype(np.float32)
@@ -172,6 +252,7 @@ def test_extreme_points_lose_at_most_a_slice_of_the_hull(cases):
             parity.assert_within(np.append(far, 0) / bound, 1, "of the bound of a slice")
 
 
+@pytest.mark.usefixtures("platform")
 def test_what_a_list_holds_beyond_its_end_joins_no_cluster():
     rng = np.random.default_rng(0)
     size, num = hull.CHUNK_POINTS + 900, hull.CHUNK_POINTS + 300
@@ -192,8 +273,8 @@ def test_what_a_list_holds_beyond_its_end_joins_no_cluster():
 
 def test_a_cpu_describes_clusters_in_native_loops():
     rows = jnp.zeros(900, jnp.int32), jnp.zeros(900, jnp.int32), jnp.int32(9), jnp.zeros((1000, 2))
-    assert count_loops(find_bounds, *rows) == (1, 1)
-    assert count_loops(point_moments, *rows, jnp.zeros((parity.MAX_CLUSTERS, 2))) == (1, 1)
+    assert count_loops(find_bounds.jitted, *rows) == (1, 1)
+    assert count_loops(point_moments.jitted, *rows, jnp.zeros((parity.MAX_CLUSTERS, 2))) == (1, 1)
 
 
 def fits_of(cases):
@@ -202,6 +283,7 @@ def fits_of(cases):
     return points, count, (lists, jnp.arange(MAX_FITS), np.int32(len(count)))
 
 
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("criterion", CRITERIA)
 def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, criterion):
     options = {"num_angles": SETTINGS.num_angles, "min_distance_m": SETTINGS.min_distance_m}
@@ -227,6 +309,7 @@ def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, cr
     parity.assert_share(worse, len(count), 2e-3, f"best {criterion}")
 
 
+@pytest.mark.usefixtures("platform")
 def test_smallest_area_is_that_of_opencv_within_the_bound_of_the_step(cases):
     points, count, fits = fits_of(cases)
     curve, _ = try_rotations(*fits, criterion="area", num_angles=SETTINGS.num_angles, min_distance_m=0.05)
@@ -239,6 +322,7 @@ def test_smallest_area_is_that_of_opencv_within_the_bound_of_the_step(cases):
         assert length * width - 1e-3 <= area <= length * width + bound + 1e-3
 
 
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("criterion", CRITERIA)
 def test_a_cluster_without_points_has_no_extents_and_a_finite_curve(criterion):
     x, y = jnp.array([1.0, 2, 3]), jnp.array([1.0, 1, 2])
@@ -251,6 +335,7 @@ def test_a_cluster_without_points_has_no_extents_and_a_finite_curve(criterion):
     np.testing.assert_array_equal(np.stack(extents)[:, :, 1], 0)
 
 
+@pytest.mark.usefixtures("platform")
 def test_scene_direction_is_that_of_the_reference():
     rng = np.random.default_rng(0)
     options = {"num_angles": 90, "sigma_deg": SETTINGS.direction_sigma_deg}
@@ -288,6 +373,7 @@ def test_scene_direction_of_sweeps_is_that_of_the_reference(cases):
         assert direction == np.argmax(preference)
 
 
+@pytest.mark.usefixtures("platform")
 def test_descriptors_are_those_of_the_reference(cases):
     for case in cases:
         xy = case.obstacles.xyz[:, :2].astype(np.float32)
@@ -332,6 +418,7 @@ def test_descriptors_of_a_rectangle_a_point_and_none_are_those_worked_by_hand():
     np.testing.assert_allclose(found.complexity, [1, 1, 0])
 
 
+@pytest.mark.usefixtures("platform")
 def test_a_hull_beyond_its_capacity_is_fitted_to_by_its_own_vertices():
     config = dataclasses.replace(DetectorConfig.paper(), hull=HullConfig(max_vertices=4))
     angle = np.arange(40) * (2 * np.pi / 40)

@@ -10,7 +10,7 @@ import pytest
 from scipy import ndimage
 from test_masked import count_loops
 
-from jaxbox import box, clustering, reference, selection
+from jaxbox import box, clustering, devices, reference, selection
 from jaxbox.config import ComponentMap, DetectorConfig
 from jaxbox.reference.clusters import NO_CLUSTER
 
@@ -22,7 +22,7 @@ GATES |= parity.select_options(parity.CONFIG.vehicles, "min_extent_m")
 MAX_RUNS = 2**14
 
 
-@functools.partial(jax.jit, static_argnames=("row", "max_runs"))
+@functools.partial(parity.PerForm, static_argnames=("row", "max_runs"))
 def label_cells(cells, *, row, max_runs):
     """Components of the maps' cells, (maps, N), and what else is known of them."""
     flags = jnp.zeros(row.num_flags, jnp.uint8).at[row.flag(cells)].set(1)
@@ -30,7 +30,7 @@ def label_cells(cells, *, row, max_runs):
     return components.at(cells), components
 
 
-@functools.partial(jax.jit, static_argnames="max_clusters")
+@functools.partial(parity.PerForm, static_argnames="max_clusters")
 def select_clusters(component, xy, height, in_slab, first, *, max_clusters, **gates):
     statistics = selection.find_statistics(
         component, height.size, xy, height, in_slab, max_components=MAX_RUNS
@@ -38,7 +38,7 @@ def select_clusters(component, xy, height, in_slab, first, *, max_clusters, **ga
     return selection.select_clusters(statistics, first, max_clusters=max_clusters, **gates)
 
 
-list_points = jax.jit(box.list_points, static_argnames=("num_clusters", "max_points"))
+list_points = parity.PerForm(box.list_points, static_argnames=("num_clusters", "max_points"))
 
 
 def cell_options(component_map: ComponentMap):
@@ -114,6 +114,7 @@ def test_cells_are_those_of_the_reference(cases):
             assert np.isin(steps, row.strides[i]).all()
 
 
+@pytest.mark.usefixtures("platform")
 def test_components_are_exactly_those_of_the_reference(cases):
     for case in cases:
         grids = [reference.grid_cells(*members_of(case, m), **cell_options(m)) for m in MAPS.values()]
@@ -144,7 +145,6 @@ SHAPES = {
 @pytest.mark.parametrize("name", SHAPES)
 def test_components_of_random_grids_are_those_of_scipy_on_every_platform(name):
     # From single cells to one component, past the density at which paths are longest.
-    label = jax.jit(functools.partial(label_cells.__wrapped__), static_argnames=("row", "max_runs"))
     rng = np.random.default_rng(0)
     row = clustering.CellRow(SHAPES[name])
     size = max(np.prod(shape) for shape in SHAPES[name])
@@ -152,7 +152,7 @@ def test_components_of_random_grids_are_those_of_scipy_on_every_platform(name):
         grids = [rng.random(shape) < density for shape in SHAPES[name]]
         where = [rng.permutation(np.argwhere(grid)) for grid in grids]
         cells = np.stack([parity.pad(in_row(c, row, i), size) for i, c in enumerate(where)])
-        component, components = label(cells, row=row, max_runs=MAX_RUNS)
+        component, components = label_cells(cells, row=row, max_runs=MAX_RUNS)
         for i, grid in enumerate(grids):
             labels = np.zeros(grid.shape, np.int32)
             ndimage.label(grid, np.ones((3, 3, 3)), output=labels)
@@ -163,11 +163,89 @@ def test_components_of_random_grids_are_those_of_scipy_on_every_platform(name):
             np.testing.assert_array_equal(np.asarray(component)[i, : len(expected)], expected)
 
 
+def spiral(size):
+    """(size, size) bool: one path of cells from a corner to the middle, a cell apart from itself."""
+    grid, place, step = np.zeros((size, size), bool), np.zeros(2, int), np.array([0, 1])
+    grid[0, 0] = True
+    for side in [size - 1, *np.repeat(np.arange(size - 1, 0, -2), 2)]:
+        for _ in range(side):
+            place += step
+            grid[tuple(place)] = True
+        step = np.array([step[1], -step[0]])
+    return grid
+
+
+def snake(size):
+    """(size, size) bool: every other line, joined at its end to the next."""
+    grid = np.arange(size)[:, None] % 2 == np.zeros(size)
+    grid[1::4, -1] = grid[3::4, 0] = True
+    return grid
+
+
+def comb(bits):
+    """Teeth that begin in the order of their numbers' bits reversed, each joined to the next further down.
+
+    In each round every other of the trees that are left hooks onto a lower one: `bits` rounds in all.
+    """
+    num = 2**bits
+    grid = np.zeros((num + 4, 4 * num), bool)
+    for i in range(2 * num):
+        start = int(f"{i // 2:0{bits}b}"[::-1], 2) if i % 2 == 0 else num
+        grid[start : num + 1, 2 * i] = True
+    for i in range(2 * num - 1):
+        grid[num + 1 + 2 * (i % 2), 2 * i : 2 * i + 3] = True
+    grid[num + 2, 2:-2:2] = True
+    return grid
+
+
+LONG_WAYS = {"spiral": spiral(71), "snake": snake(71), "comb": comb(6), "comb on its side": comb(4).T}
+LONG_ROW = clustering.CellRow(((72, 256, 1),))
+
+
+def label_grid(grid, label=label_cells):
+    cells = np.argwhere(grid[..., None])
+    padded = parity.pad(in_row(cells, LONG_ROW, 0), 2**13)
+    return np.asarray(label(padded[None], row=LONG_ROW, max_runs=MAX_RUNS)[0])[0, : len(cells)]
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("name", LONG_WAYS)
+def test_long_and_winding_ways_are_one_component_each_on_every_platform(name):
+    grid = LONG_WAYS[name]
+    assert ndimage.label(grid, np.ones((3, 3)))[1] == 1
+    np.testing.assert_array_equal(label_grid(grid), 1)
+    # And cut in two, two.
+    cut = grid.copy()
+    cut[:, grid.shape[1] // 2] = False
+    labels, num = ndimage.label(cut, np.ones((3, 3)))
+    found = label_grid(cut)
+    assert len(set(found)) == num > 1
+    assert len(set(zip(found, labels[cut], strict=True))) == num
+
+
+def test_the_first_rounds_are_not_enough_for_the_comb(monkeypatch):
+    # Or the test above would not need the loop that goes on.
+    label = parity.PerForm(label_cells.function, static_argnames=("row", "max_runs"))
+    monkeypatch.setattr(jax.lax, "while_loop", lambda _, __, state: state)
+    with devices.building_for(accelerator=True):
+        assert len(set(label_grid(LONG_WAYS["comb"], label))) > 1
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("num_strips", [1, 2, 9])
+def test_counts_of_words_are_summed_up_strip_after_strip_on_every_platform(num_strips):
+    count = np.random.default_rng(num_strips).integers(0, 17, (clustering.STRIP_WORDS, num_strips), np.int32)
+    before, total = jax.jit(functools.partial(clustering._prefix))(count)
+    expected = np.cumsum(count.T).reshape(num_strips, -1).T - count
+    np.testing.assert_array_equal(before, expected)
+    assert int(total) == count.sum()
+
+
 @pytest.mark.parametrize("name", SHAPES)
 def test_a_cpu_joins_runs_in_native_loops(name):
     row = clustering.CellRow(SHAPES[name])
     cells = jnp.zeros((len(row.shapes), 9), jnp.int32)
-    num_loops, num_native = count_loops(label_cells, cells, row=row, max_runs=MAX_RUNS)
+    num_loops, num_native = count_loops(label_cells.jitted, cells, row=row, max_runs=MAX_RUNS)
     assert num_native == num_loops > 2 * max(map(len, row.lines_back))
 
 
@@ -180,11 +258,12 @@ def test_a_cpu_finds_statistics_in_native_loops(num_maps):
     assert num_native == num_loops == -(-num_maps // selection.MAPS_PER_LOOP)
 
 
+@pytest.mark.usefixtures("platform")
 def test_runs_beyond_the_capacity_belong_to_no_component():
     cells = np.stack([np.arange(0, 400, 2) % 20, np.arange(0, 400, 2) // 20 * 2, np.zeros(200)], axis=1)
     row = clustering.CellRow(((20, 40, 1),))
     cells = in_row(cells.astype(np.int32), row, 0)[None]
-    for capacity in (201, 200, 100, 1):
+    for capacity in (201, 200, 1):
         component, components = label_cells(cells, row=row, max_runs=capacity)
         assert int(components.num_runs[0]) == 200
         assert (np.asarray(component) == clustering.NONE).sum() == max(201 - capacity, 0)
@@ -192,14 +271,14 @@ def test_runs_beyond_the_capacity_belong_to_no_component():
 
 @pytest.mark.usefixtures("platform")
 def test_runs_beyond_the_capacity_join_nothing():
-    label = jax.jit(functools.partial(label_cells.__wrapped__), static_argnames=("row", "max_runs"))
     row = clustering.CellRow(((20, 40, 1),))
     # The third touches the first, and nothing the second.
     cells = in_row(np.array([[0, 1, 0], [0, 30, 0], [1, 0, 0]], np.int32), row, 0)[None]
     for capacity, expected in ((4, [1, 2, 1]), (3, [1, 2, 0]), (2, [1, 0, 0])):
-        assert label(cells, row=row, max_runs=capacity)[0].tolist() == [expected]
+        assert label_cells(cells, row=row, max_runs=capacity)[0].tolist() == [expected]
 
 
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("name", list(MAPS))
 def test_clusters_that_pass_the_gates_are_exactly_those_of_the_reference(cases, name):
     for case in cases:
@@ -230,6 +309,7 @@ def test_clusters_that_pass_the_gates_are_exactly_those_of_the_reference(cases, 
         np.testing.assert_array_equal(clusters.high[:count], [points.max(axis=0) for points in members])
 
 
+@pytest.mark.usefixtures("platform")
 def test_the_lists_of_the_maps_join_without_gaps_and_end_at_their_capacities():
     # Map 0 has components 1 to 4, map 1 has 5 and 6, map 2 has 7 to 9; each of one point but 2 and 7.
     component = np.array([1, 3, 4, 5, 6, 8, 9, 2, 2, 7, 7], np.int32)
@@ -251,6 +331,7 @@ def test_the_lists_of_the_maps_join_without_gaps_and_end_at_their_capacities():
         assert clusters.sum_by_map(clusters.num_points).tolist() == clusters.kept.tolist()
 
 
+@pytest.mark.usefixtures("platform")
 def test_fitted_points_are_exactly_those_of_the_reference(cases):
     settings = parity.CONFIG.box
     limits = parity.select_options(settings, "min_slab_points", "max_points")

@@ -1,5 +1,6 @@
 """Parity with the reference end to end: the same boxes from the same sweep, for all presets."""
 
+import functools
 import importlib
 
 import numpy as np
@@ -7,7 +8,7 @@ import parity
 import pytest
 
 import jaxbox
-from jaxbox import DetectorConfig, reference
+from jaxbox import DetectorConfig, devices, reference
 
 MIN_SCORE = 0.05
 PRESETS = DetectorConfig.presets()
@@ -35,8 +36,14 @@ def num_partners(boxes, others):
 
 
 def detect(case, preset):
+    return detect_in_form(case, preset, devices.on_accelerator())
+
+
+@functools.cache
+def detect_in_form(case, preset, accelerator):
     cloud = jaxbox.PointCloud.from_numpy(case.xyz, capacity=parity.CAPACITY)
-    return parity.on_host(jaxbox.detect(cloud, PRESETS[preset]))
+    with devices.building_for(accelerator=accelerator):
+        return parity.on_host(jaxbox.detect(cloud, PRESETS[preset]))
 
 
 def both(cases, preset, use_plane):
@@ -91,3 +98,16 @@ def test_on_planes_of_their_own_most_boxes_are_the_same(cases, preset, limit):
     # candidates hold walls too, so that its plane, and with it every height, is less sure.
     bad, total = missing(both(cases, preset, use_plane=lambda plane: None))
     parity.assert_share(bad, total, limit, f"boxes of {preset}, each on its own plane")
+
+
+@pytest.mark.parametrize("preset", list(PRESETS))
+def test_the_form_for_accelerators_finds_what_the_form_for_a_cpu_does(cases, preset):
+    for case in cases[SWEEPS]:
+        ours, theirs = (detect_in_form(case, preset, accelerator) for accelerator in (False, True))
+        assert ours.status == theirs.status
+        for name in ("label", "valid"):
+            np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+        boxes, others = boxes_of(ours), boxes_of(theirs)
+        assert len(boxes) > 5
+        parity.assert_within(boxes[:, :7] - others[:, :7], 1e-4, f"m and rad of the boxes of {preset}")
+        parity.assert_within(boxes[:, 7] - others[:, 7], 1e-5, f"scores of {preset}")

@@ -23,20 +23,20 @@ NUM_RAYS = parity.CONFIG.completion.num_rays
 SIZES = ("length_m", "width_m")
 LIMITS = ("max_length_m", "max_width_m")
 
-build_evidence = jax.jit(
+build_evidence = parity.PerForm(
     evidence.build_evidence, static_argnames=("num_azimuths", "num_ranges", "range_cell_m")
 )
 ground_support = jax.jit(evidence.ground_support)
 
 
-@jax.jit
+@parity.PerForm
 def cast_rays(seen, boxes):
     center, (length, width, yaw) = boxes[:, :2], boxes[:, 2:].T
     options = {"num_rays": NUM_RAYS, "range_cell_m": RANGE_CELL_M}
     return evidence.cast_rays(seen, center, length, width, yaw, **options)
 
 
-@jax.jit
+@parity.PerForm
 def complete(readings, points, seen, number):
     """Every cluster tried as one class."""
     cluster = jnp.arange(parity.MAX_CLUSTERS)
@@ -51,6 +51,32 @@ def random_boxes(count, rng):
     return columns.astype(np.float32)
 
 
+@parity.PerForm
+def pack_words(beams, hits):
+    return evidence._free_words(beams), evidence._hit_words(hits)
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("num_blocks", [1, 2, 21])
+def test_words_hold_the_sums_of_all_cells_before_and_the_next_hit_beyond(num_blocks):
+    num_azimuths, rng = 12, np.random.default_rng(num_blocks)
+    shape = num_blocks, evidence.BLOCK, num_azimuths
+    cell = np.arange(num_blocks * evidence.BLOCK)[:, None]
+    for share in (0.0, 0.01, 0.1, 1.0):
+        hits = rng.random((len(cell), num_azimuths)) < share
+        beams = rng.integers(-1, 2, hits.shape, np.int32) * hits
+        free, hit = map(np.asarray, pack_words(beams.reshape(shape), hits.reshape(shape)))
+        is_free = np.cumsum(beams, axis=0) > 0
+        np.testing.assert_array_equal(evidence.flagged_cells(free), is_free)
+        np.testing.assert_array_equal(evidence.flagged_cells(hit), hits)
+        before = np.cumsum(is_free, axis=0)[:: evidence.BLOCK] - is_free[:: evidence.BLOCK]
+        np.testing.assert_array_equal(free >> evidence.BLOCK, before)
+        next_hit = np.minimum.accumulate(np.where(hits, cell, evidence.NEVER)[::-1])[::-1]
+        beyond = np.append(next_hit[evidence.BLOCK :: evidence.BLOCK], [[evidence.NEVER] * num_azimuths], 0)
+        np.testing.assert_array_equal(hit >> evidence.BLOCK, beyond)
+
+
+@pytest.mark.usefixtures("platform")
 def test_evidence_differs_in_few_cells_only(cases):
     wrong = np.zeros(4, int)
     for case in cases:
@@ -78,6 +104,7 @@ def test_ground_support_is_looked_up_where_the_reference_does(cases):
         np.testing.assert_array_equal(ground_support(case.evidence_as_input(), xy), expected)
 
 
+@pytest.mark.usefixtures("platform")
 def test_rays_over_boxes_end_as_in_the_reference(cases):
     rng = np.random.default_rng(0)
     for case in cases:
@@ -121,6 +148,7 @@ def rows_of(boxes: Boxes, expected):
     return np.column_stack(parts)[: len(expected)][is_box], np.array(theirs)
 
 
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("number", [0, 1])
 def test_completed_boxes_are_those_of_the_reference(cases, number):
     vehicle = parity.CONFIG.vehicles.classes[number]

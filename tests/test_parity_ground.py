@@ -19,9 +19,9 @@ RANSAC = parity.select_options(
 STATIC_FILTER = ("half_x_m", "half_y_m", "cell_m", "num_levels", "num_iterations")
 STATIC_SURFACE = ("cell_m", "half_m", "num_envelope_rounds")
 
-filter_outliers = jax.jit(filtering.filter_outliers, static_argnames=STATIC_FILTER)
+filter_outliers = parity.PerForm(filtering.filter_outliers, static_argnames=STATIC_FILTER)
 cell_minima = jax.jit(functools.partial(ground.cell_minima, **CANDIDATE_HALF))
-fit_ground_plane = jax.jit(
+fit_ground_plane = parity.PerForm(
     functools.partial(ground.fit_ground_plane, **RANSAC),
     static_argnames=("num_hypotheses", "num_refits"),
 )
@@ -34,6 +34,7 @@ def height_above_ground(xyz, planes, surface):
     return height - ground.surface_height(surface, xyz[:, :2], **parity.SURFACE_GRID)
 
 
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("changes", [{}, {"num_std": 1.5, "min_density": 3.0, "bandwidth_m": 0.7}])
 def test_filter_keeps_the_points_that_the_reference_keeps(cases, changes):
     options = parity.REGION | FILTER | changes
@@ -59,6 +60,7 @@ def test_cell_minima_are_those_of_the_reference(cases):
         parity.assert_share(differ.sum(), len(differ), 2e-3, "cell minima")
 
 
+@pytest.mark.usefixtures("platform")
 def test_planes_of_different_draws_agree_where_one_has_decisive_support(cases):
     decisive = []
     for number, case in enumerate(cases):
@@ -120,3 +122,49 @@ def test_what_rounding_puts_past_the_last_cell_is_no_minimum_of_another():
     xyz = np.tile(np.array([[2.1, 0, -9]], np.float32), (8, 1))
     _, occupied = ground.cell_minima(xyz, np.ones(8, bool), half_x_m=2.2, half_y_m=2.2)
     assert not occupied.any()
+
+
+def crowds():
+    """Point sets of every awkward kind, (n, 3) m."""
+    rng = np.random.default_rng(0)
+    some = rng.normal(0, [9, 9, 0.3], (400, 3))
+    on_a_line = np.linspace(0, 1, 50)[:, None] * [7.0, 3, 0.2]
+    return {
+        "none": np.zeros((0, 3)),
+        "one": some[:1],
+        "two": some[:2],
+        "on a line": on_a_line,
+        "on a wall": on_a_line + rng.uniform(0, 3, (50, 1)) * [0, 0, 1],
+        "all in one place": np.tile(some[:1], (60, 1)),
+        "beyond the border": some * [9, 9, 1],
+        "many": some,
+        "two levels": np.concatenate([some * [1, 1, 0], some * [1, 1, 0] + [0, 0, 1]]),
+    }
+
+
+CROWDS = crowds()
+
+
+# As many as do not fill the last batch of a CPU, and one alone.
+@pytest.mark.parametrize(("num_hypotheses", "num_refits"), [(33, 2), (1, 0)])
+@pytest.mark.parametrize("crowd", CROWDS)
+def test_the_plane_is_the_same_in_both_forms(crowd, num_hypotheses, num_refits):
+    xyz = CROWDS[crowd]
+    options = {"num_hypotheses": num_hypotheses, "num_refits": num_refits, "min_inlier_fraction": 0.02}
+    points = parity.pad(xyz, 1024), parity.padded_mask(len(xyz), 1024)
+    for seed in range(3):
+        plane, other = parity.in_both_forms(fit_ground_plane, *points, jax.random.key(seed), **options)
+        assert (plane.found, plane.num_inliers) == (other.found, other.num_inliers)
+        np.testing.assert_allclose(plane.coefficients, other.coefficients, rtol=0, atol=1e-5)
+        assert plane.found or crowd not in ("many", "two levels") or num_hypotheses == 1
+
+
+@pytest.mark.parametrize("crowd", CROWDS)
+def test_the_filter_keeps_the_same_points_in_both_forms(crowd):
+    xyz = CROWDS[crowd]
+    options = FILTER | {"half_x_m": 16.0, "half_y_m": 12.0}
+    xyz1 = parity.pad(np.pad(xyz, ((0, 0), (0, 1)), constant_values=1), 1024)
+    keep, other = parity.in_both_forms(filter_outliers, xyz1, **options)
+    np.testing.assert_array_equal(keep, other)
+    assert not keep[len(xyz) :].any()
+    assert keep.any() == (len(xyz) > 2)

@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import parity
+import pytest
 
-from jaxbox import geometry, reference, vehicles
+from jaxbox import devices, geometry, reference, vehicles
 
 SETTINGS = parity.CONFIG.vehicles
 AROUND = parity.select_options(SETTINGS, "margin_m", "ring_m", "upper_height_m", "stray_share")
@@ -38,8 +39,10 @@ HEIGHTS = ("height_m", "height_below_m", "height_above_m", "min_height_m", "max_
 MAX_BOXES = 1024
 NUM_RANDOM = 300
 
-count_points_around = jax.jit(functools.partial(vehicles.count_points_around, **parity.REGION, **AROUND))
-suppress = jax.jit(vehicles.suppress)
+count_points_around = parity.PerForm(
+    functools.partial(vehicles.count_points_around, **parity.REGION, **AROUND)
+)
+suppress = parity.PerForm(vehicles.suppress)
 rectangle_iou = jax.jit(jax.vmap(geometry.rectangle_iou))
 
 
@@ -52,14 +55,36 @@ def boxes_of(case, rng):
     return np.concatenate([found, moved]).astype(np.float32)
 
 
-def test_points_round_boxes_are_those_of_the_reference(cases):
+@functools.cache
+def counted_by_reference(cases):
+    """Of each case: boxes, the heights of their classes, how far behind faces is recessed, and the counts."""
     rng = np.random.default_rng(0)
     limits = parity.select_options(parity.CONFIG.ground, "min_height_m", "max_height_m")
     class_tops = [vehicle.count_max_height_m for vehicle in SETTINGS.classes]
+    rows = []
     for case in cases:
         boxes = boxes_of(case, rng)
         tops = rng.choice(class_tops, len(boxes)).astype(np.float32)
         recess = rng.choice([-1, 0.15, 0.3], len(boxes)).astype(np.float32)
+        counts = [
+            reference.count_points_around(
+                box,
+                case.obstacles.xyz,
+                case.obstacles.height,
+                **AROUND,
+                **limits,
+                count_max_height_m=float(top),
+                recess_m=float(recess_m),
+            )
+            for box, top, recess_m in zip(boxes.astype(float), tops, recess, strict=True)
+        ]
+        rows.append((case, boxes, tops, recess, counts))
+    return rows
+
+
+@pytest.mark.usefixtures("platform")
+def test_points_round_boxes_are_those_of_the_reference(cases):
+    for case, boxes, tops, recess, counted in counted_by_reference(cases):
         xy, height = case.obstacles.xyz[:, :2].astype(np.float32), case.obstacles.height.astype(np.float32)
         around = count_points_around(
             parity.pad(boxes, MAX_BOXES),
@@ -72,16 +97,7 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
         )
         around = parity.on_host(around)
         wrong, seen, tops_m = 0, 0, []
-        for row, box in enumerate(boxes.astype(float)):
-            expected = reference.count_points_around(
-                box,
-                case.obstacles.xyz,
-                case.obstacles.height,
-                **AROUND,
-                **limits,
-                count_max_height_m=float(tops[row]),
-                recess_m=float(recess[row]),
-            )
+        for row, expected in enumerate(counted):
             theirs = np.array(
                 [expected.inside, expected.overhead, expected.ring, expected.upper, expected.recessed]
             )
@@ -186,6 +202,7 @@ def test_overlap_of_boxes_is_that_of_opencv(cases):
         assert np.std(expected) > 0.1
 
 
+@pytest.mark.usefixtures("platform")
 def test_suppression_keeps_the_boxes_that_the_reference_keeps(cases):
     rng = np.random.default_rng(0)
     for case in cases:
@@ -204,3 +221,59 @@ def test_suppression_keeps_the_boxes_that_the_reference_keeps(cases):
         # Overlaps of just the limit may round to either side of it.
         parity.assert_share(np.sum(keep[: len(boxes)] != expected), len(boxes), 0.01, "kept boxes")
         assert 10 < expected.sum() < len(boxes) / 2
+
+
+def row_of_boxes(count, step_m):
+    """(count, 5) boxes of 4 x 2 m, each so much farther along x than the one before."""
+    return np.array([step_m, 0, 0, 0, 0] * np.arange(count)[:, None] + [0, 20, 4, 2, 0], np.float32)
+
+
+HEAPS = {
+    "none": row_of_boxes(0, 1),
+    "one": row_of_boxes(1, 1),
+    "apart": row_of_boxes(70, 4.5),
+    "all the same": row_of_boxes(33, 0),
+    # Each overlaps the next and no other: every other one is kept, and of the last that is known last.
+    "a chain": row_of_boxes(70, 3),
+    "a chain, last first": row_of_boxes(70, 3)[::-1],
+    "a chain of pairs": np.repeat(row_of_boxes(40, 3), 2, axis=0),
+    "a chain whose links overlap two more": row_of_boxes(70, 1.2),
+}
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("heap", HEAPS)
+@pytest.mark.parametrize("room", [80, 96])
+def test_chains_and_heaps_of_boxes_are_suppressed_as_by_the_reference(heap, room):
+    boxes = HEAPS[heap]
+    scores = np.arange(len(boxes), 0, -1) / 100
+    kept = reference.suppress(boxes.astype(float), scores, max_overlap=SETTINGS.max_overlap)
+    keep = suppress(
+        parity.pad(boxes, room), parity.padded_mask(len(boxes), room), max_overlap=SETTINGS.max_overlap
+    )
+    np.testing.assert_array_equal(np.flatnonzero(keep), np.sort(kept))
+
+
+def test_the_chains_are_longer_than_the_rounds_without_a_look(monkeypatch):
+    # Or the test above would not need the loop that goes on.
+    boxes = HEAPS["a chain"]
+    monkeypatch.setattr(jax.lax, "while_loop", lambda _, __, state: state)
+    with devices.building_for(accelerator=True):
+        keep = vehicles.suppress(boxes, jnp.ones(len(boxes), bool), max_overlap=SETTINGS.max_overlap)
+    assert not np.array_equal(np.flatnonzero(keep), np.arange(0, len(boxes), 2))
+
+
+@pytest.mark.parametrize(("num_boxes", "num_points"), [(0, 0), (0, 9000), (1, 1), (200, 0), (200, 20000)])
+def test_points_round_crowded_boxes_are_the_same_in_both_forms(num_boxes, num_points):
+    # 200 boxes in the midst of 20,000 points take thousands of blocks more than are looked at together.
+    rng = np.random.default_rng(num_boxes)
+    boxes = rng.uniform([-3, -3, 1, 1, -4], [3, 3, 12, 3, 4], (200, 5)).astype(np.float32)
+    xy, height = rng.uniform(-5, 5, (20000, 2)), rng.uniform(0, 3, 20000)
+    tops, recess = np.float32(rng.choice([2.2, 4], 200)), np.float32(rng.choice([-1, 0.3], 200))
+    points = np.float32(xy), np.float32(height), num_points
+    cpu, other = parity.in_both_forms(count_points_around, boxes, tops, recess, num_boxes, *points)
+    rows, others = cpu.rows[:num_boxes], other.rows[:num_boxes]
+    whole = [0, 2, 3, 4, 5]
+    np.testing.assert_array_equal(rows[:, whole], others[:, whole])
+    np.testing.assert_allclose(rows[:, 1], others[:, 1], atol=1e-6)
+    assert (rows[:, 0].sum() > 0) == (num_boxes > 1 and num_points > 0)

@@ -1,0 +1,138 @@
+"""Steps of `detect` in both of their forms, for a CPU and for an accelerator: the same, at the edges too."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import parity
+import pytest
+
+from jaxbox import DetectorConfig, devices, masked, steps
+from jaxbox.config import ComponentMap
+from jaxbox.steps import decision
+from jaxbox.steps.points import Obstacles
+from jaxbox.steps.proposals import CHUNK
+
+ROOM = CHUNK + 900
+"""Rows for obstacles: no whole number of chunks."""
+
+
+def test_a_function_per_form_keeps_the_program_of_each():
+    total = parity.PerForm(masked.prefix_sum)
+    values = np.arange(700, dtype=np.int32)
+    loops = []
+    for accelerator in (False, True, False, True):
+        with devices.building_for(accelerator=accelerator):
+            np.testing.assert_array_equal(total(values), np.cumsum(values))
+            loops.append(total.jitted.lower(values).as_text().count("stablehlo.while"))
+    assert loops == [1, 0, 1, 0]
+
+
+# Proposals.
+
+
+@functools.cache
+def two_maps():
+    """Settings of a map seen from above and one in space, with little room for cells and clusters."""
+    base = DetectorConfig()
+    maps = (
+        ComponentMap(cell_m=0.2, max_cells=2048, max_clusters=40),
+        ComponentMap(cell_m=0.5, num_levels=8, max_cells=1024, max_clusters=24, max_height_m=3.5),
+    )
+    # No point is drawn nearer: that rounds otherwise in another form, and so across the edge of a cell.
+    clustering = dataclasses.replace(base.clustering, maps=maps, min_points=3.0, adaptive_start_m=1e3)
+    return dataclasses.replace(base, clustering=clustering)
+
+
+@parity.PerForm
+def propose(xy, height, num_points):
+    present = jnp.arange(ROOM) < num_points
+    obstacles = Obstacles(jnp.arange(ROOM), xy, height, present, num_points, ROOM)
+    return steps.propose_clusters(obstacles, two_maps())
+
+
+def heaps_of_points(seed, spread_m, num_heaps):
+    """(ROOM, 2) and (ROOM,) m: heaps of points about places all over the region, and some beyond it."""
+    rng = np.random.default_rng(seed)
+    place = rng.uniform([-90, -60], [90, 60], (num_heaps, 2))
+    xy = place[rng.integers(num_heaps, size=ROOM)] + rng.normal(0, spread_m, (ROOM, 2))
+    return xy.astype(np.float32), rng.uniform(0, 4, ROOM).astype(np.float32)
+
+
+@pytest.mark.parametrize("num_points", [0, 1, CHUNK - 1, CHUNK, CHUNK + 1, ROOM, 2 * ROOM])
+@pytest.mark.parametrize(("spread_m", "num_heaps"), [(0.5, 30), (0.8, 150), (0.0, 1)])
+def test_proposals_are_the_same_bits_in_both_forms(num_points, spread_m, num_heaps):
+    xy, height = heaps_of_points(num_points, spread_m, num_heaps)
+    cpu, other = parity.in_both_forms(propose, xy, height, np.int32(num_points))
+    for field in dataclasses.fields(cpu):
+        one, two = getattr(cpu, field.name), getattr(other, field.name)
+        rows = slice(int(cpu.num_clusters)) if field.name in ("num_points", "low", "high") else ...
+        np.testing.assert_array_equal(one[rows], two[rows], err_msg=field.name)
+    assert (cpu.num_clusters > 0) == (num_points > 1 and num_heaps > 1)
+    # The last heaps find no room for their cells, nor for their clusters.
+    assert (cpu.num_runs.sum() > 3072) == (num_points > 1 and num_heaps == 150)
+
+
+# Decision.
+
+choose = parity.PerForm(decision._choose, static_argnames="capacity")
+best_first = parity.PerForm(decision._best_first)
+
+NUM_ROWS = 37
+"""No whole number of the steps of `_best_first`."""
+
+
+def scores_of(kind):
+    rng = np.random.default_rng(0)
+    score = {
+        "none": np.zeros(NUM_ROWS),
+        "one": np.arange(NUM_ROWS) == 7,
+        "the last": np.arange(NUM_ROWS) == NUM_ROWS - 1,
+        "all the same": np.ones(NUM_ROWS),
+        "ties": rng.integers(0, 5, NUM_ROWS) / 4,
+        "all different": rng.permutation(NUM_ROWS) / NUM_ROWS,
+        "some the least": np.where(rng.random(NUM_ROWS) < 0.5, LEAST, rng.random(NUM_ROWS)),
+    }
+    return score[kind].astype(np.float32)
+
+
+LEAST = 0.25
+KINDS = ("none", "one", "the last", "all the same", "ties", "all different", "some the least")
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("capacity", [1, 5, NUM_ROWS, NUM_ROWS + 4])
+def test_the_highest_scores_above_the_least_are_chosen_and_of_ties_the_first(kind, capacity):
+    score = scores_of(kind)
+    row, num = choose(score, capacity=capacity, min_score=np.float32(LEAST))
+    above = np.flatnonzero(score > LEAST)
+    assert int(num) == len(above)
+    best = above[np.argsort(-score[above], kind="stable")][:capacity]
+    assert row.shape == (capacity,)
+    np.testing.assert_array_equal(row[: len(best)], np.sort(best))
+    np.testing.assert_array_equal(row[len(best) :], NUM_ROWS)
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("kind", KINDS)
+def test_rows_with_a_score_come_best_first_and_of_ties_the_first_row_first(kind):
+    score = scores_of(kind)
+    num = masked.rows_in_use(jnp.asarray(score > 0))
+    expected = np.argsort(-score, kind="stable")[: np.sum(score > 0)]
+    order = best_first(score, num)
+    np.testing.assert_array_equal(order[: len(expected)], expected)
+    np.testing.assert_array_equal(order[len(expected) :], NUM_ROWS)
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("size", [1, 5, 40])
+def test_rows_in_use_end_with_the_last_that_is_present(size):
+    in_use = jax.jit(functools.partial(masked.rows_in_use))
+    assert int(in_use(np.zeros(size, bool))) == 0
+    for last in range(size):
+        present = np.random.default_rng(last).random(size) < 0.3
+        present[last:] = [True] + [False] * (size - last - 1)
+        assert int(in_use(present)) == last + 1
