@@ -6,7 +6,7 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
-from jaxbox.cli.cache import CACHE_VARIABLE, enable_cache
+from jaxbox.cache import CACHE_VARIABLE, CacheFolders
 from jaxbox.config import DetectorConfig
 from jaxbox.padding import CAPACITY_BUCKETS
 from jaxbox.versions import versions
@@ -29,7 +29,9 @@ def print_info(console: Console, *, as_json: bool = False) -> None:
         table.add_row(package, version)
     console.print(table)
     console.print(f"devices: {', '.join(devices)}")
-    console.print(f"compiled functions: {enable_cache() or 'not kept'} (set {CACHE_VARIABLE} to change)")
+    kept = CacheFolders.of_this_process()
+    console.print(f"compiled programs: {kept.compiled or 'not kept'} (set {CACHE_VARIABLE} to change)")
+    console.print(f"traced programs: {kept.programs or 'not kept'}")
     console.print(f"point capacities: {', '.join(str(bucket) for bucket in CAPACITY_BUCKETS)}")
     table = Table("preset", "ground", "maps", "rectangle", "completion", title="presets")
     for name, config in presets.items():
