@@ -39,7 +39,7 @@ STAGES = {
     "vehicles", "projection",
 }  # fmt: skip
 WIRING = {"steps", "detector"}
-KEPT = {"program_files", "programs", "cache"}
+KEPT = {"program_files", "programs", "cache", "shipping"}
 MANY = {"batching", "streaming", "workers"}
 TOOLS = {"io", "evaluation", "viz"}
 ALLOWED = {

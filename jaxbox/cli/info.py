@@ -1,5 +1,6 @@
 """``jaxbox info``: versions, devices and presets."""
 
+import dataclasses
 import json
 
 import jax
@@ -9,6 +10,7 @@ from rich.table import Table
 from jaxbox.cache import CACHE_VARIABLE, CacheFolders
 from jaxbox.config import DetectorConfig
 from jaxbox.padding import CAPACITY_BUCKETS
+from jaxbox.shipping import shipped_state
 from jaxbox.versions import versions
 
 
@@ -21,7 +23,12 @@ def print_info(console: Console, *, as_json: bool = False) -> None:
     """
     devices, presets = [str(device) for device in jax.devices()], DetectorConfig.presets()
     if as_json:
-        found = {"versions": versions(formats=True), "devices": devices, "presets": list(presets)}
+        found = {
+            "versions": versions(formats=True),
+            "devices": devices,
+            "presets": list(presets),
+            "shipped_programs": dataclasses.asdict(shipped_state()),
+        }
         console.out(json.dumps(found), highlight=False)
         return
     table = Table("package", "version", title="versions")
@@ -31,7 +38,7 @@ def print_info(console: Console, *, as_json: bool = False) -> None:
     console.print(f"devices: {', '.join(devices)}")
     kept = CacheFolders.of_this_process()
     console.print(f"compiled programs: {kept.compiled or 'not kept'} (set {CACHE_VARIABLE} to change)")
-    console.print(f"traced programs: {kept.programs or 'not kept'}")
+    console.print(f"traced programs: {kept.programs or 'not kept'}; shipped with jaxbox: {shipped_state()}")
     console.print(f"point capacities: {', '.join(str(bucket) for bucket in CAPACITY_BUCKETS)}")
     table = Table("preset", "ground", "maps", "rectangle", "completion", title="presets")
     for name, config in presets.items():
