@@ -45,7 +45,11 @@ TRACED_WITH = (
 KEY_IMPL = "threefry2x32"
 """JAX's own kind of random key, the only one that kept programs take."""
 _KEY_WORDS = 2
-_LOCATIONS = "jax_traceback_in_locations_limit"
+_NO_LOCATIONS = {
+    "jax_traceback_in_locations_limit": 0,
+    "jax_hlo_source_file_canonicalization_regex": ".*",
+}
+"""No lines of source; JAX 0.6 names one all the same, and no file then."""
 
 _Compiled = Callable[..., list[jax.Array]]
 
@@ -219,12 +223,14 @@ def trace(build: Build, half: Half) -> jax.export.Exported:
 @contextlib.contextmanager
 def _without_locations() -> Iterator[None]:
     """Leaves out which lines of which files a program came from: the same program is then the same bytes."""
-    limit = jax.config.values[_LOCATIONS]
-    jax.config.update(_LOCATIONS, 0)
+    before = {name: jax.config.values[name] for name in _NO_LOCATIONS}
     try:
+        for name, value in _NO_LOCATIONS.items():
+            jax.config.update(name, value)
         yield
     finally:
-        jax.config.update(_LOCATIONS, limit)
+        for name, value in before.items():
+            jax.config.update(name, value)
 
 
 @functools.cache
