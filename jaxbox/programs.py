@@ -106,15 +106,15 @@ class KeptPrograms:
     run. Each half of it is compiled by a thread of its own, or loaded from JAX's cache.
     """
 
-    def __init__(self, folder: pathlib.Path | None, *, shipped: pathlib.Path = SHIPPED) -> None:
+    def __init__(self, folder: pathlib.Path | None, *, shipped: pathlib.Path | None = None) -> None:
         """Reads nothing yet.
 
         Args:
           folder: where traced programs are kept; None to keep none.
-          shipped: where those that came with the installation are.
+          shipped: where those that came with the installation are; None for `SHIPPED`.
         """
         self.folder = folder
-        self._shipped = shipped
+        self._shipped = SHIPPED if shipped is None else shipped
         self._compiled: dict[tuple[Any, ...], list[_Compiled]] = {}
         self._lock = threading.Lock()
 
