@@ -16,7 +16,7 @@ import numpy as np
 
 import jaxbox
 from jaxbox import Detections, DetectorConfig, PointCloud, Status
-from jaxbox.cli.cache import enable_cache
+from jaxbox.cache import cache_folder, keep_compiled, make_private
 from jaxbox.io import Sweep, atomic_writer, open_sweeps
 from jaxbox.settings import parse_change, replace_settings
 from jaxbox.workers import THREADS_VARIABLE
@@ -71,6 +71,13 @@ def parser(description: str, *, preset: bool = True, quick: str | None = None) -
         options.add_argument("--quick", action="store_true", help=quick)
     options.add_argument("--json", type=pathlib.Path, help="also write the report to this file")
     return options
+
+
+def enable_cache() -> None:
+    """Switches JAX's compilation cache on, without jaxbox's traced programs: `detect` is one function."""
+    folder = cache_folder(os.environ)
+    if folder is not None and make_private(folder) is None:
+        keep_compiled(folder)
 
 
 def chosen_config(options: argparse.Namespace, *, preset: str | None = None) -> DetectorConfig:

@@ -21,7 +21,7 @@ import numpy as np
 
 import jaxbox
 from jaxbox import Detections, DetectorConfig, PointCloud, Status, io, synthetic
-from jaxbox.cli.cache import enable_cache
+from jaxbox.cache import enable_cache
 from jaxbox.summary import Summary
 
 FAST_SWEEPS, SLOW_SWEEPS = 4, 100

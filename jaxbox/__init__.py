@@ -1,6 +1,7 @@
 """jaxbox: training-free LiDAR vehicle detection as one compiled JAX function."""
 
 from jaxbox.batching import detect_batch
+from jaxbox.cache import enable_cache
 from jaxbox.config import DEFAULT_CUT, DetectorConfig
 from jaxbox.detector import detect
 from jaxbox.streaming import StreamedSweep, stream
@@ -21,6 +22,7 @@ __all__ = [
     "__version__",
     "detect",
     "detect_batch",
+    "enable_cache",
     "stack_clouds",
     "stream",
 ]

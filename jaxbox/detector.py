@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +57,40 @@ def detect(
 
     Reference: paper, section 3; oracle `jaxbox.reference.detect`.
     """
-    return _detect_jit(*_operands(cloud, config, key))
+    operands = _operands(cloud, config, key)
+    detections = None if _programs is None else _programs(*operands)
+    return _detect_jit(*operands) if detections is None else detections
+
+
+class Programs(Protocol):
+    """What `detect` asks first, where the cache is on: `jaxbox.programs.KeptPrograms`."""
+
+    @property
+    def num_compiled(self) -> int:
+        """Programs that were compiled, or loaded from the cache, in this process."""
+        ...
+
+    def __call__(self, cloud: PointCloud, settings: "PackedSettings", key: jax.Array, /) -> Detections | None:
+        """The bits of `detect`, or None for what it has no program for, such as operands being traced."""
+        ...
+
+
+_programs: Programs | None = None
+
+
+def use_programs(programs: Programs | None) -> None:
+    """Has `detect` ask for a program that needs no tracing before it traces one.
+
+    Args:
+      programs: who is asked; None for nobody.
+    """
+    global _programs  # noqa: PLW0603 - one a process, as JAX's cache is
+    _programs = programs
+
+
+def kept_programs() -> Programs | None:
+    """Who `detect` asks for a program that needs no tracing."""
+    return _programs
 
 
 def segment(
@@ -79,7 +112,7 @@ def segment(
     Raises:
       ValueError: for settings that contradict each other.
     """
-    return _segment_jit(*_operands(cloud, config, key))
+    return segment_packed(*_operands(cloud, config, key))
 
 
 def decide(cloud: PointCloud, segments: Segments, config: DetectorConfig | None = None) -> Detections:
@@ -97,7 +130,7 @@ def decide(cloud: PointCloud, segments: Segments, config: DetectorConfig | None 
       ValueError: for settings that contradict each other.
     """
     cloud, settings, _ = _operands(cloud, config, None)
-    return _decide_jit(cloud, segments, settings)
+    return decide_packed(cloud, segments, settings)
 
 
 def lower(
@@ -127,10 +160,10 @@ def lower(
 
 def _operands(
     cloud: PointCloud, config: DetectorConfig | None, key: jax.Array | None
-) -> tuple[PointCloud, "_Settings", jax.Array]:
+) -> tuple[PointCloud, "PackedSettings", jax.Array]:
     config = DetectorConfig() if config is None else config
     steps.check_settings(config)
-    settings = _Settings.pack(config, accelerator=on_accelerator(cloud.xyz1))
+    settings = PackedSettings.pack(config, accelerator=on_accelerator(cloud.xyz1))
     return cloud, settings, _default_key() if key is None else key
 
 
@@ -142,12 +175,13 @@ def _default_key() -> jax.Array:
 
 def count_compilations() -> int:
     """How often `detect` has been compiled, or loaded from the cache, in this process."""
-    return _detect_jit._cache_size()  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
+    num_jitted: int = _detect_jit._cache_size()  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
+    return num_jitted + (0 if _programs is None else _programs.num_compiled)
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class _Settings:
+class PackedSettings:
     """A configuration whose thresholds are one array: to hand over a hundred takes JAX a millisecond."""
 
     thresholds: jax.Array | np.ndarray  # (T,) float32
@@ -155,7 +189,8 @@ class _Settings:
     accelerator: bool = dataclasses.field(metadata={"static": True})  # what the program is built for
 
     @classmethod
-    def pack(cls, config: DetectorConfig, *, accelerator: bool) -> "_Settings":
+    def pack(cls, config: DetectorConfig, *, accelerator: bool) -> "PackedSettings":
+        """Packs settings, with what the program is built for."""
         values, structure = jax.tree.flatten(config)
         traced = {i: jnp.float32(v) for i, v in enumerate(values) if isinstance(v, jax.Array)}
         known = np.array([0 if i in traced else v for i, v in enumerate(values)], np.float32)
@@ -164,6 +199,7 @@ class _Settings:
         return cls(known, structure, accelerator)
 
     def unpack(self) -> DetectorConfig:
+        """The settings, with traced thresholds."""
         # Cut up together: each threshold that a loop reads would else be a kernel of its own.
         values = jnp.asarray(self.thresholds)
 
@@ -206,7 +242,7 @@ def _decide(cloud: PointCloud, segments: Segments, config: DetectorConfig) -> De
     )
 
 
-def _find_vehicles(cloud: PointCloud, settings: _Settings, key: jax.Array) -> Detections:
+def _find_vehicles(cloud: PointCloud, settings: PackedSettings, key: jax.Array) -> Detections:
     with building_for(accelerator=settings.accelerator):
         config = settings.unpack()
         return _decide(cloud, _segment(cloud, config, key), config)
@@ -218,20 +254,22 @@ _detect_jit = jax.jit(_find)
 
 
 @jax.jit
-def _segment_jit(cloud: PointCloud, settings: _Settings, key: jax.Array) -> Segments:
+def segment_packed(cloud: PointCloud, settings: PackedSettings, key: jax.Array) -> Segments:
+    """`segment`, of settings that were checked and packed."""
     with building_for(accelerator=settings.accelerator):
         return _segment(cloud, settings.unpack(), key)
 
 
 @jax.jit
-def _decide_jit(cloud: PointCloud, segments: Segments, settings: _Settings) -> Detections:
+def decide_packed(cloud: PointCloud, segments: Segments, settings: PackedSettings) -> Detections:
+    """`decide`, of settings that were checked and packed."""
     with building_for(accelerator=settings.accelerator):
         return _decide(cloud, segments, settings.unpack())
 
 
 @_find.def_vmap
 def _find_many(
-    _size: int, batched: Any, cloud: PointCloud, settings: _Settings, key: jax.Array
+    _size: int, batched: Any, cloud: PointCloud, settings: PackedSettings, key: jax.Array
 ) -> tuple[Detections, Any]:
     """A batch: on a CPU its sweeps one after the other, on an accelerator all of them step by step.
 

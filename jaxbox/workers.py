@@ -20,7 +20,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, Generic, TypeVar
 
-import jax
+from jaxbox.cache import CacheFolders
 
 THREADS_VARIABLE = "NPROC"
 """Environment variable by which XLA is told how many threads a process may take."""
@@ -168,18 +168,18 @@ class _Surroundings:
     """What a process must know before JAX starts in it."""
 
     num_threads: int
-    cache_folder: str | None
+    cache_folders: CacheFolders
 
     @classmethod
     def of_this(cls, workers: int) -> "_Surroundings":
         return cls(
             num_threads=max(1, (os.cpu_count() or 1) // workers),
-            cache_folder=jax.config.values["jax_compilation_cache_dir"],
+            cache_folders=CacheFolders.of_this_process(),
         )
 
     def apply(self) -> None:
         os.environ.setdefault(THREADS_VARIABLE, str(self.num_threads))
-        jax.config.update("jax_compilation_cache_dir", self.cache_folder)
+        self.cache_folders.apply()
 
 
 class _Process:

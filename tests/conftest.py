@@ -29,6 +29,8 @@ def pytest_configure(config: pytest.Config) -> None:
     """
     folder = os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(config.cache.mkdir("jax")))
     jax.config.update("jax_compilation_cache_dir", folder)
+    # The user's own cache is left alone, also by the processes that tests start.
+    os.environ["JAXBOX_CACHE_DIR"] = ""
     # Two, so that work over several devices can be tested; the first is the default as ever.
     jax.config.update("jax_num_cpu_devices", 2)
 

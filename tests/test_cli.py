@@ -4,7 +4,6 @@ import dataclasses
 import functools
 import json
 import os
-import pathlib
 import shutil
 import subprocess
 import sys
@@ -14,8 +13,8 @@ import pytest
 from typer.testing import CliRunner
 
 import jaxbox
-from jaxbox import synthetic
-from jaxbox.cli import app, cache, demo, eval_pictures
+from jaxbox import cache, synthetic
+from jaxbox.cli import app, demo, eval_pictures
 from jaxbox.cli.report import (
     SHOWN_MIN_SCORE,
     FrameOutcome,
@@ -415,16 +414,6 @@ def test_every_status_bit_is_described_for_a_sweep_and_counted_for_a_run(kitti_f
     summary = "\n".join(describe_run(RunReport(frames=[FrameOutcome.of(frame)], failures=[("b", "why")])))
     assert all(f"{bit.name} in 1 of 1 sweeps" in summary for bit in Status if bit)
     assert "failed: b: why" in summary
-
-
-def test_the_cache_folder_follows_the_environment():
-    home = pathlib.Path.home()
-    assert cache.cache_folder({}) == home / ".cache" / "jaxbox"
-    assert cache.cache_folder({"XDG_CACHE_HOME": "/x"}) == pathlib.Path("/x/jaxbox")
-    assert cache.cache_folder({"XDG_CACHE_HOME": "/x", "JAXBOX_CACHE_DIR": "/y"}) == pathlib.Path("/y")
-    assert cache.enable_cache({"JAXBOX_CACHE_DIR": ""}) is None
-    assert cache.enable_cache({"JAXBOX_CACHE_DIR": "/proc/no/such"}) is None
-    assert cache.enable_cache({"JAX_COMPILATION_CACHE_DIR": "/z"}) == pathlib.Path("/z")
 
 
 def test_results_without_scores_end_with_exit_code_2_and_the_file(kitti_folder, detected, tmp_path):

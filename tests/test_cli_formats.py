@@ -16,8 +16,8 @@ from test_io_formats import write_foxglove
 from typer.testing import CliRunner
 
 import jaxbox
-from jaxbox import io
-from jaxbox.cli import app, cache, sweep_info
+from jaxbox import cache, io
+from jaxbox.cli import app, sweep_info
 from jaxbox.config import DetectorConfig
 from jaxbox.io import mcap_results, parquet
 from jaxbox.io import rerun as rerun_results

@@ -12,8 +12,7 @@ import pytest
 from test_cli import make_small_sweep, run, write_points
 from test_io_formats import write_foxglove
 
-from jaxbox import io, workers
-from jaxbox.cli import cache
+from jaxbox import cache, io, workers
 from jaxbox.cli.results import Results
 
 COMMON = ("--preset", "paper", "--format", "both", "--format", "parquet", "--format", "mcap")

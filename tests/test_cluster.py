@@ -22,8 +22,9 @@ import pytest
 from test_cli import make_small_sweep, run, write_points
 from test_io_formats import write_foxglove
 
-from jaxbox import io
-from jaxbox.cli import cache, detect_ray
+from jaxbox import cache, io
+from jaxbox.cache import CacheFolders
+from jaxbox.cli import detect_ray
 from jaxbox.cluster import (
     ClusterError,
     DatasetReport,
@@ -221,7 +222,7 @@ def task_for(output, **changes):
     fields = {
         "config": DetectorConfig.paper(), "capacity": None, "min_score": 0.05, "topic": None, "batch": 4,
         "num_threads": 1, "versions": versions(),
-        "cache_folder": jax.config.values["jax_compilation_cache_dir"],
+        "cache_folders": CacheFolders.of_this_process(),
     }  # fmt: skip
     return Task(output=str(output), **{**fields, **changes})
 

@@ -39,19 +39,22 @@ STAGES = {
     "vehicles", "projection",
 }  # fmt: skip
 WIRING = {"steps", "detector"}
+KEPT = {"program_files", "programs", "cache", "shipping"}
 MANY = {"batching", "streaming", "workers"}
 TOOLS = {"io", "evaluation", "viz"}
 ALLOWED = {
     **dict.fromkeys(STAGES, FOUNDATION),
     **dict.fromkeys(WIRING, FOUNDATION | STAGES | WIRING),
-    **dict.fromkeys(MANY, FOUNDATION | WIRING | {"workers"}),
+    # Files of programs are read and written as all others are.
+    **dict.fromkeys(KEPT, FOUNDATION | WIRING | KEPT | {"io"}),
+    **dict.fromkeys(MANY, FOUNDATION | WIRING | {"workers", "cache"}),
     # A stream hands sweeps to devices as a batch does.
-    "streaming": FOUNDATION | WIRING | {"workers", "batching"},
+    "streaming": FOUNDATION | WIRING | {"workers", "batching", "cache"},
     "reference": {"version", "types", "class_priors", "config", "masked"},
     "synthetic": FOUNDATION | {"projection"},
     **dict.fromkeys(TOOLS, FOUNDATION | STAGES | WIRING | TOOLS),
     "export": FOUNDATION | WIRING | {"io"},
-    "cluster": FOUNDATION | WIRING | MANY | {"io"},
+    "cluster": FOUNDATION | WIRING | MANY | {"cache", "io"},
     "tuning": FOUNDATION | WIRING | TOOLS,
     "viewer": FOUNDATION | WIRING | TOOLS,
 }

@@ -112,8 +112,8 @@ def test_nothing_calls_back_to_the_host():
 
 @pytest.mark.parametrize("preset", DetectorConfig.presets().values())
 def test_thresholds_go_in_as_one_array_that_native_loops_cut_up(preset):
-    settings = detector._Settings.pack(preset, accelerator=False)
-    unpack = jax.jit(detector._Settings.unpack)
+    settings = detector.PackedSettings.pack(preset, accelerator=False)
+    unpack = jax.jit(detector.PackedSettings.unpack)
     assert unpack(settings) == jax.tree.map(jnp.float32, preset)
     num_loops, num_native = count_loops(unpack, settings)
     assert num_native == num_loops > 1
@@ -214,7 +214,7 @@ def test_only_an_accelerator_takes_a_batch_at_once_and_not_where_scatters_are_or
     monkeypatch.setattr(detector, "_one_after_the_other", lambda a, _, b: a + b)
     monkeypatch.setattr(detector, "_find_vehicles", lambda a, _, b: a - b)
     a, b = jnp.arange(3.0), jnp.float32(2)
-    settings = detector._Settings.pack(DetectorConfig(), accelerator=accelerator)
+    settings = detector.PackedSettings.pack(DetectorConfig(), accelerator=accelerator)
     found, batched = detector._find_many(3, (True, False, False), a, settings, b)
     assert batched
     np.testing.assert_array_equal(found, a - b if together else a + b)

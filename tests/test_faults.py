@@ -15,8 +15,7 @@ import pytest
 from test_cli import make_small_sweep, run, write_points
 from test_cli_formats import heard_ctrl_c, records_of
 
-from jaxbox import io
-from jaxbox.cli import cache
+from jaxbox import cache, io
 from jaxbox.io import parquet
 
 FORMATS = [word for name in ("kitti", "jsonl", "parquet", "mcap") for word in ("--format", name)]

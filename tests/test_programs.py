@@ -1,77 +1,148 @@
-"""The kept program: the bits of `detect`, read and not traced the second time, traced anew when broken."""
+"""Kept programs: the bits of `detect`, read and not traced the second time, traced anew when broken."""
 
 import dataclasses
 import gc
 import pathlib
 import platform
+import threading
+import zlib
 
 import jax
 import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_detector import CAPACITY, found, street
+from test_detector import CAPACITY, assert_same_bits, found, street
 
 import jaxbox
-from jaxbox import DetectorConfig, PointCloud
-from jaxbox.cli import cache, programs
+from jaxbox import DetectorConfig, PointCloud, detector, program_files, programs
 from jaxbox.cli.memory import giving_memory_back
-from jaxbox.cli.programs import Half
-from jaxbox.cli.timing import TimedDetector
+from jaxbox.program_files import SUFFIX, BrokenProgramError, read_made_of
+from jaxbox.programs import Half, KeptPrograms
 
+PROJECT = pathlib.Path(__file__).parents[1]
 BASE = DetectorConfig()
+CLOUD = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY)
 
 
 def changed(room, **values):
     return dataclasses.replace(BASE, **{room: dataclasses.replace(getattr(BASE, room), **values)})
 
 
-def load(folder, config=BASE, *, capacity=CAPACITY):
-    """The program, as a new process gets it."""
-    programs._compile_halves.cache_clear()
-    return programs.kept_program(config, capacity=capacity, folder=folder)
+def run(kept, cloud=CLOUD, config=BASE, key=None):
+    """The answer, or None where `detect` would have to trace."""
+    return kept(*detector._operands(cloud, config, key))
+
+
+def load(folder, config=BASE, *, capacity=CAPACITY, shipped=pathlib.Path("none")):
+    """Runs the program as a new process would, on a sweep of no points."""
+    empty = PointCloud.from_numpy(np.zeros((0, 3)), capacity=capacity)
+    return run(KeptPrograms(folder, shipped=shipped), empty, config)
 
 
 def halves(*capacities):
     return [(half, capacity) for capacity in capacities for half in Half]
 
 
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Where the program of the default preset is kept."""
+    return tmp_path_factory.mktemp("programs")
+
+
+@pytest.fixture(scope="module")
+def kept(folder):
+    """The default preset's program, compiled once for this file."""
+    kept = KeptPrograms(folder)
+    run(kept)
+    return kept
+
+
 @pytest.fixture
 def traced(monkeypatch):
     """A quick stand-in for the detector's trace, and what it was asked for."""
     asked = []
+    num_outputs = jax.tree.structure(programs._example(jaxbox.Detections)).num_leaves
 
-    def trace(half, settings, capacity):
-        asked.append((half, capacity))
-        shapes = (capacity, 4), (capacity,), (), (settings.num_leaves,)
-        dtypes = np.float32, np.float32, np.int32, np.float32
-        operands = map(jax.ShapeDtypeStruct, shapes, dtypes)
-        num_outputs = jax.tree.structure(programs._example(jaxbox.Detections)).num_leaves
+    def trace(build, half):
+        asked.append((half, build.capacity))
         outputs = {Half.SEGMENT: 0, Half.DECIDE: num_outputs}[half]
-        return jax.export.export(jax.jit(lambda *_: [jnp.zeros(())] * outputs))(*operands)
+        # The operands have to stay operands, though nothing is made of them.
+        program = jax.jit(lambda *operands: [jnp.zeros(())] * outputs, keep_unused=True)
+        return jax.export.export(program)(*build.operands())
 
-    monkeypatch.setattr(programs, "_trace", trace)
+    monkeypatch.setattr(programs, "trace", trace)
     return asked
 
 
-def test_traced_or_read_it_has_the_bits_of_detect_and_thresholds_are_inputs(tmp_path):
-    cloud = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY)
-    jax.tree.map(np.testing.assert_array_equal, load(tmp_path)(cloud), found(0))
+def test_traced_or_read_it_has_the_bits_of_detect_and_thresholds_are_inputs(kept, folder):
+    assert_same_bits(run(kept), found(0))
     assert gc.isenabled()
-    paths = sorted((tmp_path / programs.FOLDER).iterdir())
+    paths = sorted(folder.iterdir())
     written = [path.stat().st_mtime_ns for path in paths]
-    strict = changed("vehicles", min_score=0.05)
-    answer = load(tmp_path, strict)(cloud)
+    again, strict = KeptPrograms(folder), changed("vehicles", min_score=0.05)
+    answer = run(again, config=strict)
     assert [path.stat().st_mtime_ns for path in paths] == written
-    assert paths == sorted((tmp_path / programs.FOLDER).iterdir())
-    jax.tree.map(np.testing.assert_array_equal, answer, jaxbox.detect(cloud, strict))
+    assert paths == sorted(folder.iterdir())
+    assert_same_bits(answer, jaxbox.detect(CLOUD, strict))
     assert 0 < answer.valid.sum() < found(0).valid.sum()
+    assert kept.num_compiled == again.num_compiled == 1
+
+
+def test_the_random_key_is_an_input(kept):
+    key = jax.random.key(7)
+    assert_same_bits(run(kept, key=key), jaxbox.detect(CLOUD, key=key))
+    assert kept.num_compiled == 1
 
 
 def test_without_evidence_it_has_the_bits_of_detect(tmp_path):
-    cloud = PointCloud.from_numpy(street(1).xyz, capacity=CAPACITY)
-    paper = DetectorConfig.paper()
-    jax.tree.map(np.testing.assert_array_equal, load(tmp_path, paper)(cloud), jaxbox.detect(cloud, paper))
+    cloud, paper = PointCloud.from_numpy(street(1).xyz, capacity=CAPACITY), DetectorConfig.paper()
+    assert_same_bits(run(KeptPrograms(tmp_path), cloud, paper), jaxbox.detect(cloud, paper))
+
+
+def test_on_another_device_it_has_the_bits_and_stays_there(kept):
+    second = jax.devices("cpu")[1]
+    answer = run(kept, jax.device_put(CLOUD, second))
+    assert answer.center.devices() == {second}
+    assert_same_bits(answer, found(0))
+    with jax.default_device(second):
+        assert run(kept).center.devices() == {second}
+    assert kept.num_compiled == 2
+
+
+def test_what_it_has_no_program_for_is_left_to_detect(traced, tmp_path):
+    kept = KeptPrograms(tmp_path)
+    first, second = jax.devices("cpu")
+    apart = dataclasses.replace(
+        jax.device_put(CLOUD, first), intensity=jax.device_put(CLOUD.intensity, second)
+    )
+    assert run(kept, apart) is None
+    assert run(kept, dataclasses.replace(CLOUD, num_points=5)) is None
+    assert run(kept, dataclasses.replace(CLOUD, num_points=np.int16(5))) is None
+    assert run(kept, jaxbox.stack_clouds([CLOUD, CLOUD])) is None
+    assert run(kept, key=jax.random.key(0, impl="rbg")) is None
+    assert run(kept, key=jax.random.split(jax.random.key(0))) is None
+    assert run(kept, key=jax.random.PRNGKey(0)) is None
+    with jax.disable_jit():
+        assert run(kept) is None
+    assert not traced
+    assert kept.num_compiled == 0
+
+
+def test_tracers_are_left_to_detect(traced, tmp_path):
+    kept, asked = KeptPrograms(tmp_path), []
+
+    def detect(cloud, config, key):
+        asked.append(run(kept, cloud, config, key))
+        return 0
+
+    jax.jit(detect)(CLOUD, BASE, jax.random.key(0))
+    jax.jit(lambda key: detect(CLOUD, BASE, key))(jax.random.key(0))
+    jax.jit(lambda config: detect(CLOUD, config, None))(BASE)
+    jax.vmap(lambda cloud: detect(cloud, BASE, None))(jaxbox.stack_clouds([CLOUD, CLOUD]))
+    jax.vmap(lambda key: detect(CLOUD, BASE, key))(jax.random.split(jax.random.key(0)))
+    assert asked == [None] * 5
+    assert not traced
 
 
 def test_it_is_traced_once_for_its_static_settings_and_capacity(traced, tmp_path):
@@ -84,47 +155,111 @@ def test_it_is_traced_once_for_its_static_settings_and_capacity(traced, tmp_path
     assert traced == halves(CAPACITY, 2 * CAPACITY, CAPACITY)
     with jax.default_matmul_precision("highest"):
         load(tmp_path)
-    assert len(traced) == len(list((tmp_path / programs.FOLDER).iterdir())) == 8
+    assert len(traced) == len(list(tmp_path.iterdir())) == 8
+
+
+def test_within_a_process_jax_options_make_another_program(traced, tmp_path):
+    kept = KeptPrograms(tmp_path)
+    run(kept)
+    with jax.default_matmul_precision("highest"):
+        run(kept)
+    run(kept)
+    assert traced == 2 * halves(CAPACITY)
+    assert kept.num_compiled == 2
+
+
+def test_threads_that_ask_together_compile_once(traced, tmp_path):
+    kept = KeptPrograms(tmp_path)
+    threads = [threading.Thread(target=run, args=(kept,)) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert traced == halves(CAPACITY)
+    assert kept.num_compiled == 1
+
+
+def flipped(data, place):
+    return data[:place] + bytes([data[place] ^ 1]) + data[place + 1 :]
 
 
 @pytest.mark.parametrize("half", Half)
 def test_a_broken_file_is_traced_anew(traced, tmp_path, half):
     load(tmp_path)
-    (path,) = (tmp_path / programs.FOLDER).glob(f"*.{half}.*")
+    path = next(path for path in tmp_path.iterdir() if read_made_of(path)["half"] == half)
     whole = path.read_bytes()
-    for broken in (b"", whole[: len(whole) // 2], b"\xff" * 64):
+    places = (0, 20, len(whole) // 2, len(whole) - 1)
+    damaged = [b"", whole[: len(whole) // 2], b"\xff" * 64, *(flipped(whole, place) for place in places)]
+    for broken in damaged:
         path.write_bytes(broken)
+        with pytest.raises(BrokenProgramError, match=path.name):
+            read_made_of(path)
         load(tmp_path)
         load(tmp_path)
-    assert traced == halves(CAPACITY) + 3 * [(half, CAPACITY)]
+    assert traced == halves(CAPACITY) + len(damaged) * [(half, CAPACITY)]
+    assert read_made_of(path)["half"] == half
 
 
-def test_a_folder_that_cannot_be_made_does_not_matter(traced, tmp_path):
+def test_a_program_under_the_name_of_another_is_not_run(traced, tmp_path):
+    load(tmp_path)
+    one, other = tmp_path.iterdir()
+    one.write_bytes(other.read_bytes())
+    load(tmp_path)
+    assert len(traced) == 3
+
+
+@pytest.mark.parametrize("name", ["source_digest", "version"])
+def test_a_program_of_another_source_or_version_is_not_run(traced, tmp_path, monkeypatch, name):
+    load(tmp_path)
+    if name == "version":
+        monkeypatch.setattr(jax, "__version__", "0.0.1")
+    else:
+        monkeypatch.setattr(programs, "source_digest", lambda: "another")
+    load(tmp_path)
+    assert traced == 2 * halves(CAPACITY)
+
+
+def test_programs_that_were_shipped_are_read_first_and_never_written(traced, tmp_path):
+    shipped, folder = tmp_path / "shipped", tmp_path / "kept"
+    load(shipped)
+    written = {path: path.read_bytes() for path in shipped.iterdir()}
+    load(folder, shipped=shipped)
+    load(None, shipped=shipped)
+    assert traced == halves(CAPACITY)
+    assert not folder.exists()
+    load(folder, capacity=2 * CAPACITY, shipped=shipped)
+    assert len(list(folder.iterdir())) == 2
+    assert {path: path.read_bytes() for path in shipped.iterdir()} == written
+
+
+def test_a_folder_that_cannot_be_written_does_not_matter(traced, tmp_path):
     (tmp_path / "file").touch()
-    load(tmp_path / "file")
-    assert traced == halves(CAPACITY)
+    assert load(tmp_path / "file") is not None
+    assert load(None) is not None
+    assert traced == halves(CAPACITY, CAPACITY)
 
 
-def test_settings_that_contradict_each_other_are_refused_though_a_program_is_kept(traced, tmp_path):
-    with pytest.raises(ValueError, match=r"evidence\.enabled"):
-        load(tmp_path, changed("evidence", enabled=False))
-    assert not traced
+def test_what_is_traced_does_not_depend_on_where_the_source_lies(folder, kept):
+    for path in folder.iterdir():
+        made_of, program = program_files._read(path)
+        program = zlib.decompress(program)
+        assert str(PROJECT).encode() not in program
+        assert b".py" not in program
+        assert str(PROJECT) not in str(made_of)
 
 
-def test_the_command_line_keeps_programs_in_its_own_cache_only(traced, tmp_path, monkeypatch):
-    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path))
-    users = jax.config.values["jax_compilation_cache_dir"]
-    cloud = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY)
-    assert users != str(tmp_path)
-    jax.tree.map(np.testing.assert_array_equal, TimedDetector(BASE)(cloud)[0], found(0))
-    assert not traced
-    try:
-        jax.config.update("jax_compilation_cache_dir", str(tmp_path))
-        programs._compile_halves.cache_clear()
-        TimedDetector(BASE)(cloud)
-    finally:
-        jax.config.update("jax_compilation_cache_dir", users)
-    assert traced == halves(CAPACITY)
+def test_nothing_is_written_half(traced, tmp_path, monkeypatch):
+    def fail(path, data):
+        with path.open("wb") as file:
+            file.write(data[: len(data) // 2])
+        raise OSError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(pathlib.Path, "write_bytes", fail)
+        assert load(tmp_path) is not None
+    assert list(tmp_path.iterdir()) == []
+    load(tmp_path)
+    assert {path.suffix for path in tmp_path.iterdir()} == {SUFFIX}
 
 
 def resident_mb():

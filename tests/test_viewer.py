@@ -18,8 +18,7 @@ from viewer_sweeps import write_kitti, write_three_streets
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from jaxbox import DetectorConfig, PointCloud, io
-from jaxbox.cli import cache
+from jaxbox import DetectorConfig, PointCloud, cache, io
 from jaxbox.cli import view as view_command
 from jaxbox.detector import count_compilations
 from jaxbox.io import _extras

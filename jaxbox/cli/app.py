@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from jaxbox.cli.cache import enable_cache
-from jaxbox.cli.console import input_errors, stdout
+from jaxbox.cache import enable_cache
+from jaxbox.cli.console import cache_warnings, input_errors, stdout
 from jaxbox.cli.demo import run_demo
 from jaxbox.cli.detect import DetectOptions, ResultFormat, run_detect
 from jaxbox.cli.detect_ray import RayOptions, run_detect_ray
@@ -153,7 +153,8 @@ def _common(
     ] = False,
 ) -> None:
     compute_on_one_thread()
-    enable_cache()
+    with cache_warnings():
+        enable_cache()
 
 
 @app.command(epilog=EXIT_CODES)

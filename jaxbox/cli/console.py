@@ -5,6 +5,7 @@ import enum
 import signal
 import sys
 import threading
+import warnings
 from collections.abc import Iterator
 
 import typer
@@ -13,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.progress import TimeRemainingColumn as _TimeLeft
 from rich.text import Text
 
+from jaxbox.cache import CacheWarning
 from jaxbox.io import InputError
 
 FILE_WIDTH = 120
@@ -45,6 +47,16 @@ def stderr() -> Console:
 def print_error(message: str) -> None:
     """Prints one line to stderr, as it stands: a path may hold what looks like markup."""
     stderr().print(Text.assemble(("error: ", "bold red"), message))
+
+
+@contextlib.contextmanager
+def cache_warnings() -> Iterator[None]:
+    """Turns the reason why nothing is kept between runs into one line on stderr."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", CacheWarning)
+        yield
+    for warning in caught:
+        stderr().print(Text.assemble(("warning: ", "bold yellow"), str(warning.message)))
 
 
 @contextlib.contextmanager

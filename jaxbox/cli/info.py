@@ -1,14 +1,16 @@
 """``jaxbox info``: versions, devices and presets."""
 
+import dataclasses
 import json
 
 import jax
 from rich.console import Console
 from rich.table import Table
 
-from jaxbox.cli.cache import CACHE_VARIABLE, enable_cache
+from jaxbox.cache import CACHE_VARIABLE, CacheFolders
 from jaxbox.config import DetectorConfig
 from jaxbox.padding import CAPACITY_BUCKETS
+from jaxbox.shipping import shipped_state
 from jaxbox.versions import versions
 
 
@@ -21,7 +23,12 @@ def print_info(console: Console, *, as_json: bool = False) -> None:
     """
     devices, presets = [str(device) for device in jax.devices()], DetectorConfig.presets()
     if as_json:
-        found = {"versions": versions(formats=True), "devices": devices, "presets": list(presets)}
+        found = {
+            "versions": versions(formats=True),
+            "devices": devices,
+            "presets": list(presets),
+            "shipped_programs": dataclasses.asdict(shipped_state()),
+        }
         console.out(json.dumps(found), highlight=False)
         return
     table = Table("package", "version", title="versions")
@@ -29,7 +36,9 @@ def print_info(console: Console, *, as_json: bool = False) -> None:
         table.add_row(package, version)
     console.print(table)
     console.print(f"devices: {', '.join(devices)}")
-    console.print(f"compiled functions: {enable_cache() or 'not kept'} (set {CACHE_VARIABLE} to change)")
+    kept = CacheFolders.of_this_process()
+    console.print(f"compiled programs: {kept.compiled or 'not kept'} (set {CACHE_VARIABLE} to change)")
+    console.print(f"traced programs: {kept.programs or 'not kept'}; shipped with jaxbox: {shipped_state()}")
     console.print(f"point capacities: {', '.join(str(bucket) for bucket in CAPACITY_BUCKETS)}")
     table = Table("preset", "ground", "maps", "rectangle", "completion", title="presets")
     for name, config in presets.items():

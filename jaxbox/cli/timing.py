@@ -1,28 +1,21 @@
 """The detector with a clock: compile time apart from run time."""
 
-import os
 import time
 
 import jax
 import numpy as np
 
 import jaxbox
-from jaxbox.cli.cache import cache_folder
 from jaxbox.cli.memory import giving_memory_back
-from jaxbox.cli.programs import Program, kept_program
 from jaxbox.config import DetectorConfig
 from jaxbox.types import Detections, PointCloud
 
 
 class TimedDetector:
-    """Runs `jaxbox.detect` and times it; the first sweep of each capacity waits for the compiler.
-
-    Where jaxbox's own cache is on, the traced program is kept beside what was compiled of it.
-    """
+    """Runs `jaxbox.detect` and times it; the first sweep of each capacity waits for the compiler."""
 
     def __init__(self, config: DetectorConfig) -> None:
         self._config = config
-        self._programs: dict[int, Program] = {}
         self.compile_s: dict[int, float] = {}
         """Seconds that each capacity took to compile, or to load from the cache."""
 
@@ -37,19 +30,11 @@ class TimedDetector:
         start = time.perf_counter()
         empty = PointCloud.from_numpy(np.zeros((0, 3), np.float32), capacity=capacity)
         with giving_memory_back():
-            self._programs[capacity] = self._program(capacity)
             self._run(empty)
         _, again_s = self._run(empty)
         return time.perf_counter() - start - 2 * again_s
 
-    def _program(self, capacity: int) -> Program:
-        folder = cache_folder(os.environ)
-        # A folder that the user gave to JAX is JAX's alone.
-        if folder is None or jax.config.values["jax_compilation_cache_dir"] != str(folder):
-            return lambda cloud: jaxbox.detect(cloud, self._config)
-        return kept_program(self._config, capacity=capacity, folder=folder)
-
     def _run(self, cloud: PointCloud) -> tuple[Detections, float]:
         start = time.perf_counter()
-        detections = jax.block_until_ready(self._programs[cloud.capacity](cloud))
+        detections = jax.block_until_ready(jaxbox.detect(cloud, self._config))
         return detections, time.perf_counter() - start

@@ -16,6 +16,7 @@ from typing import Any
 import jax
 
 from jaxbox import io
+from jaxbox.cache import CacheFolders
 from jaxbox.cluster.reports import DatasetReport, PartitionReport
 from jaxbox.cluster.sources import SweepRef, list_sweeps
 from jaxbox.cluster.store import Store
@@ -105,7 +106,7 @@ def detect_dataset(
         topic=topic,
         batch=batch,
         num_threads=cpus_per_worker,
-        cache_folder=jax.config.values["jax_compilation_cache_dir"],
+        cache_folders=CacheFolders.of_this_process(),
         versions=versions(formats=True),
     )
     given = [sources] if isinstance(sources, str | os.PathLike) else list(sources)

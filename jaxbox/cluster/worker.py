@@ -17,6 +17,7 @@ import numpy as np
 
 from jaxbox import io
 from jaxbox.batching import detect_batch
+from jaxbox.cache import CacheFolders
 from jaxbox.cluster.reports import PartitionReport
 from jaxbox.cluster.sources import SweepReader, SweepRef
 from jaxbox.cluster.store import Store
@@ -80,8 +81,8 @@ class Task:
     """Sweeps that are read ahead and detected together."""
     num_threads: int
     """Of XLA in each worker."""
-    cache_folder: str | None
-    """Where compiled programs are kept; None for nowhere."""
+    cache_folders: CacheFolders
+    """Where traced and compiled programs are kept."""
     versions: Mapping[str, str]
     """Of the driver."""
 
@@ -147,7 +148,7 @@ class PartitionWorker:
     def __init__(self, task: Task) -> None:
         """Prepares JAX, which must not have started in this process."""
         os.environ.setdefault(THREADS_VARIABLE, str(task.num_threads))
-        jax.config.update("jax_compilation_cache_dir", task.cache_folder)
+        task.cache_folders.apply()
         self._task, self._store = task, Store(task.output)
         self._reader = SweepReader(task.topic)
         self._threads = concurrent.futures.ThreadPoolExecutor(_READERS)

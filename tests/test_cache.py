@@ -1,0 +1,175 @@
+"""enable_cache(): where programs are kept, whom the folder belongs to, and that detect goes through it."""
+
+import os
+import pathlib
+import subprocess
+import sys
+
+import jax
+import pytest
+from test_detector import CAPACITY, assert_same_bits, found, street
+from typer.testing import CliRunner
+
+import jaxbox
+from jaxbox import PointCloud, cache, detector, programs
+from jaxbox.cache import CacheFolders, CacheWarning, cache_folder, make_private
+from jaxbox.cli import app
+from jaxbox.detector import count_compilations
+from jaxbox.settings import replace_settings
+
+PROJECT = pathlib.Path(__file__).parents[1]
+
+
+@pytest.fixture(autouse=True)
+def _as_it_was(monkeypatch):
+    """Afterwards the cache is off again, and JAX's where the tests have it."""
+    monkeypatch.setattr(detector, "_programs", None)
+    users = jax.config.values["jax_compilation_cache_dir"]
+    yield
+    jax.config.update("jax_compilation_cache_dir", users)
+
+
+def modes(folder):
+    return [oct(path.stat().st_mode & 0o777) for path in (folder, folder / cache.PROGRAMS)]
+
+
+def test_the_folder_follows_the_environment():
+    home = pathlib.Path.home()
+    assert cache_folder({}) == home / ".cache" / "jaxbox"
+    assert cache_folder({"XDG_CACHE_HOME": "/x"}) == pathlib.Path("/x/jaxbox")
+    assert cache_folder({"XDG_CACHE_HOME": "/x", "JAXBOX_CACHE_DIR": "/y"}) == pathlib.Path("/y")
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o000])
+def test_the_folder_is_made_for_its_owner_alone_whatever_the_umask(tmp_path, umask):
+    before = os.umask(umask)
+    try:
+        assert jaxbox.enable_cache(tmp_path / "a" / "b") == tmp_path / "a" / "b"
+    finally:
+        os.umask(before)
+    assert modes(tmp_path / "a" / "b") == ["0o700", "0o700"]
+
+
+def test_the_variable_names_the_folder_or_switches_the_cache_off(tmp_path, monkeypatch):
+    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
+    assert jaxbox.enable_cache() is None
+    assert detector.kept_programs() is None
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "named"))
+    assert jaxbox.enable_cache() == tmp_path / "named"
+    assert detector.kept_programs().folder == tmp_path / "named" / cache.PROGRAMS
+
+
+def refused(folder, match):
+    """Nothing is kept, and the reason is said; `detect` goes through programs that were shipped."""
+    users = jax.config.values["jax_compilation_cache_dir"]
+    with pytest.warns(CacheWarning, match=match):
+        assert jaxbox.enable_cache(folder) is None
+    assert detector.kept_programs().folder is None
+    assert jax.config.values["jax_compilation_cache_dir"] == users
+
+
+@pytest.mark.parametrize("mode", [0o770, 0o707, 0o777, 0o720])
+@pytest.mark.parametrize("inner", [False, True])
+def test_a_folder_that_others_may_write_to_is_refused(tmp_path, mode, inner):
+    folder = tmp_path / "cache"
+    (folder / cache.PROGRAMS).mkdir(parents=True)
+    (folder / cache.PROGRAMS if inner else folder).chmod(mode)
+    refused(folder, "Others may write to .*chmod 700")
+
+
+def test_a_folder_that_others_may_read_is_taken(tmp_path):
+    tmp_path.chmod(0o755)
+    assert jaxbox.enable_cache(tmp_path) == tmp_path
+
+
+def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
+    owner = tmp_path.stat().st_uid
+    monkeypatch.setattr(cache, "_ROOT", owner + 2)
+    monkeypatch.setattr(os, "getuid", lambda: owner + 1)
+    refused(tmp_path, "belongs to another user")
+    # Root's own is as good as one's own: root can do as it likes anyway.
+    monkeypatch.setattr(cache, "_ROOT", owner)
+    assert jaxbox.enable_cache(tmp_path) == tmp_path
+
+
+def test_a_folder_that_cannot_be_made_is_said(tmp_path):
+    (tmp_path / "file").touch()
+    refused(tmp_path / "file" / "cache", r"file: File exists.*JAXBOX_CACHE_DIR")
+    refused(tmp_path / "file", "File exists")
+
+
+def test_systems_without_owners_are_not_asked_for_them(tmp_path, monkeypatch):
+    tmp_path.chmod(0o777)
+    monkeypatch.delattr(os, "getuid")
+    assert make_private(tmp_path) is None
+
+
+def test_the_command_line_says_in_one_line_why_nothing_is_kept(tmp_path, monkeypatch):
+    tmp_path.chmod(0o777)
+    monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path))
+    result = CliRunner().invoke(app, ["info"])
+    assert result.exit_code == 0
+    (line,) = result.stderr.splitlines()
+    assert line.startswith(f"warning: Others may write to {tmp_path}")
+
+
+def test_detect_goes_through_what_is_kept_and_counts_it(tmp_path):
+    cloud = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY)
+    expected = found(0)
+    before = count_compilations()
+    jaxbox.enable_cache(tmp_path)
+    for _ in range(2):
+        assert_same_bits(jaxbox.detect(cloud), expected)
+        assert count_compilations() == before + 1
+    assert len(list((tmp_path / cache.PROGRAMS).iterdir())) == len(programs.Half)
+    assert_same_bits(jaxbox.detect_batch([cloud, cloud], devices=jax.devices()[:1])[1], expected)
+    jax.eval_shape(jax.vmap(jaxbox.detect), jaxbox.stack_clouds([cloud, cloud]))
+    assert count_compilations() == before + 1
+    blind = replace_settings(jaxbox.DetectorConfig(), {"evidence.enabled": False})
+    with pytest.raises(ValueError, match=r"evidence\.enabled"):
+        jaxbox.detect(cloud, blind)
+
+
+def test_jaxs_own_cache_stays_where_the_user_has_it(tmp_path):
+    users = jax.config.values["jax_compilation_cache_dir"]
+    assert users is not None
+    jaxbox.enable_cache(tmp_path)
+    assert jax.config.values["jax_compilation_cache_dir"] == users
+    jax.config.update("jax_compilation_cache_dir", None)
+    jaxbox.enable_cache(tmp_path / "first")
+    jaxbox.enable_cache(tmp_path / "second")
+    assert jax.config.values["jax_compilation_cache_dir"] == str(tmp_path / "second")
+
+
+LATE = """
+import os, sys
+import jax, jax.numpy as jnp
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+jax.jit(lambda x: x + 1)(1.0)
+import jaxbox
+jaxbox.enable_cache(sys.argv[1])
+jax.jit(lambda x: x + 2)(1.0)
+print([name for name in os.listdir(sys.argv[1]) if name.endswith("-cache")])
+"""
+
+
+def test_it_works_after_jax_has_compiled_something(tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    environment["PYTHONPATH"] = str(PROJECT)
+    command = [sys.executable, "-c", LATE, str(tmp_path / "cache")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert "jit_" in done.stdout
+
+
+def test_processes_that_are_started_get_the_same_folders(tmp_path):
+    assert CacheFolders.of_this_process().is_enabled is False
+    CacheFolders.of_this_process().apply()
+    assert detector.kept_programs() is None
+    jaxbox.enable_cache(tmp_path)
+    folders = CacheFolders.of_this_process()
+    detector.use_programs(None)
+    folders.apply()
+    assert CacheFolders.of_this_process() == folders
+    (tmp_path / cache.PROGRAMS).chmod(0o777)
+    folders.apply()
+    assert detector.kept_programs().folder is None
