@@ -141,6 +141,64 @@ def gpu() -> str:
     return table(["", "median ms a sweep"], rows) + made_with(scaling)
 
 
+def launches() -> str:
+    """What a GPU would be asked to do, by step: the default program before and now, a sweep and a batch."""
+    one = load("launches_before"), load("launches")
+    many = load("launches_batch_before"), load("launches_batch")
+    names = [*many[0]["steps"], "all"]
+
+    def values(report: dict[str, Any], name: str, *fields: str) -> str:
+        counts = {**report["steps"], "all": report["whole"]}.get(name, {})
+        return f"{sum(counts.get(field, 0) for field in fields):,.0f}"
+
+    def gigabytes(report: dict[str, Any], name: str) -> float:
+        counts = {**report["steps"], "all": report["whole"]}.get(name, {})
+        return (counts.get("bytes_read", 0) + counts.get("bytes_written", 0)) / 1e9
+
+    rows = [
+        (
+            name if name in ("all", "other") else f"`{name}`",
+            *(values(report, name, "launches") for report in one),
+            *(values(report, name, "waits") for report in one),
+            *(values(report, name, "launches") for report in many),
+            *(f"{gigabytes(report, name):.1f}" for report in many),
+        )
+        for name in names
+    ]
+    header = ["", "launches, before", "now", "waits, before", "now"]
+    header += ["launches of 64 sweeps, before", "now", "their GB, before", "now"]
+    return table(header, rows) + counted_for(one[1])
+
+
+def launch_totals() -> str:
+    """The whole of each program that launches were counted for."""
+    programs = {
+        "default, before": load("launches_before"),
+        "default": load("launches"),
+        "fast": load("launches_fast"),
+        "paper": load("launches_paper"),
+        "default, 64 sweeps, before": load("launches_batch_before"),
+        "default, 64 sweeps": load("launches_batch"),
+    }
+    fields = ("kernels", "copies", "in_graphs", "graphs", "waits")
+    rows = []
+    for name, report in programs.items():
+        whole = report["whole"]
+        moved = (whole["bytes_read"] / 1e9, whole["bytes_written"] / 1e9)
+        rows.append((name, *(f"{whole[f]:,.0f}" for f in fields), *moved, report["model_ms_a_sweep"]))
+    header = ["", "kernels", "copies", "of both in graphs", "graphs", "waits"]
+    return table([*header, "GB read", "GB written", "model, ms a sweep"], rows)
+
+
+def counted_for(report: dict[str, Any]) -> str:
+    """What launches were counted for."""
+    at = report["circumstances"]
+    return (
+        f"\n\n*Counted, not measured, at commit {at['commit'][:8]} for an {report['target']}, "
+        f"jax {at['packages']['jax']}.*"
+    )
+
+
 def frontier() -> str:
     """Accuracy against time of the presets."""
     report = load("frontier")
@@ -405,6 +463,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "ground": ground,
     "speed": speed,
     "gpu": gpu,
+    "launches": launches,
+    "launch_totals": launch_totals,
     "frontier": frontier,
     "peers": peers,
     "fuzz": fuzz,
