@@ -93,9 +93,10 @@ def _evaluate_alone(jaxpr: core.Jaxpr, equation: Any, given: Sequence[Any]) -> l
         for atom, value in zip(equation.invars, given, strict=True)
         if not isinstance(atom, core.Literal)
     }
-    alone = core.Jaxpr(
-        [], list(values), equation.outvars, [equation], debug_info=jaxpr.debug_info.with_unknown_names()
-    )
+    # One name for each argument and result, as JAX checks.
+    names = {"arg_names": ("",) * len(values), "result_paths": ("",) * len(equation.outvars)}
+    named = jaxpr.debug_info._replace(**names)
+    alone = core.Jaxpr([], list(values), equation.outvars, [equation], debug_info=named)
     return core.jaxpr_as_fun(core.ClosedJaxpr(alone, []))(*values.values())
 
 
