@@ -156,8 +156,8 @@ def build_evidence(
     first = jnp.minimum((first_m / range_cell_m).astype(jnp.int32) + 1, num_ranges)
     last = jnp.minimum((last_m / range_cell_m).astype(jnp.int32), num_ranges)
     is_free = downward & (last_m > first_m) & (last > first)
-    ends = jnp.stack([place(is_free, first), place(is_free, last)])
-    beams = jnp.zeros(size, jnp.int32).at[ends].add(jnp.array([[1], [-1]]), mode="drop")
+    ends = place(is_free, first), place(is_free, last)
+    beams = _count_changes(jnp.zeros(size, jnp.int32), ends)
 
     shape = (num_blocks, BLOCK, num_azimuths)
     return Evidence(
@@ -195,6 +195,14 @@ def azimuth_cell(azimuth: jax.Array, num_azimuths: int) -> jax.Array:
     whole = jnp.floor(turns).astype(jnp.int32)
     cell = jnp.floor(turns * num_azimuths).astype(jnp.int32) - num_azimuths * whole
     return jnp.where(cell < num_azimuths, cell, 0)
+
+
+def _count_changes(beams: jax.Array, ends: tuple[jax.Array, jax.Array]) -> jax.Array:
+    """Beams that begin in each cell less those that end there."""
+    if on_accelerator():
+        # One scatter reads and writes the cells once, which counts in a batch.
+        return beams.at[jnp.stack(ends)].add(jnp.array([[1], [-1]]), mode="drop")
+    return beams.at[ends[0]].add(1, mode="drop").at[ends[1]].add(-1, mode="drop")
 
 
 def _free_words(beams: jax.Array) -> jax.Array:

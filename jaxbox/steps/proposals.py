@@ -151,9 +151,12 @@ def _find_cells(
         present = start + jnp.arange(size if on_accelerator() else CHUNK) < obstacles.count
         # Stored, or each map would draw the points together anew.
         xy = store(warp(_chunk(obstacles.xy, start)))
-        found = jnp.stack(find(xy, _chunk(obstacles.height, start), present))
-        flags = flags.at[cells.flag(found)].set(1, mode="promise_in_bounds")
-        return jax.lax.dynamic_update_slice(table, found, (jnp.uint32(0), start)), flags
+        found = find(xy, _chunk(obstacles.height, start), present)
+        # One scatter for all maps reads and writes the flags once, which counts in a batch on an accelerator.
+        for i, cell in enumerate([jnp.stack(found)] if on_accelerator() else found):
+            flags = flags.at[cells.flag(cell)].set(1, mode="promise_in_bounds")
+            table = jax.lax.dynamic_update_slice(table, jnp.atleast_2d(cell), (jnp.uint32(i), start))
+        return table, flags
 
     table = jnp.zeros((len(maps), size if on_accelerator() else size + -size % CHUNK), jnp.int32)
     return _fold_chunks(step, (table, jnp.zeros(cells.num_flags, jnp.uint8)), obstacles)
