@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from test_masked import count_loops
 
-from benchmarks import bad_input
 from jaxbox import DetectorConfig, PointCloud, Status, detect, detector, devices, stack_clouds, synthetic
 from jaxbox.config import BoxConfig, EvidenceConfig
 from jaxbox.geometry import rectangle_iou
 from jaxbox.io import open_sweeps
+from quality import bad_input
 
 CAPACITY = 2**14
 SEEDS = range(5)

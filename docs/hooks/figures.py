@@ -12,7 +12,12 @@ import jaxbox
 from jaxbox.evaluation.corruptions import CORRUPTIONS
 from jaxbox.types import Counts, Status
 
-RESULTS = pathlib.Path(__file__).parents[2] / "benchmarks" / "results"
+PROJECT = pathlib.Path(__file__).parents[2]
+RESULTS = {
+    path.stem: path
+    for folder in ("benchmarks", "quality")
+    for path in (PROJECT / folder / "results").glob("*.json")
+}
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
@@ -22,7 +27,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 def load(name: str) -> dict[str, Any]:
     """One of the recorded results."""
-    return json.loads((RESULTS / f"{name}.json").read_text("utf-8"))
+    return json.loads(RESULTS[name].read_text("utf-8"))
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
