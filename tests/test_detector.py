@@ -110,6 +110,7 @@ def test_nothing_calls_back_to_the_host():
 # The same answer.
 
 
+@pytest.mark.codegen
 @pytest.mark.parametrize("preset", DetectorConfig.presets().values())
 def test_thresholds_go_in_as_one_array_that_native_loops_cut_up(preset):
     settings = detector._Settings.pack(preset, accelerator=False)

@@ -163,6 +163,7 @@ def test_components_of_random_grids_are_those_of_scipy_on_every_platform(name):
             np.testing.assert_array_equal(np.asarray(component)[i, : len(expected)], expected)
 
 
+@pytest.mark.codegen
 @pytest.mark.parametrize("name", SHAPES)
 def test_a_cpu_joins_runs_in_native_loops(name):
     row = clustering.CellRow(SHAPES[name])
@@ -171,6 +172,7 @@ def test_a_cpu_joins_runs_in_native_loops(name):
     assert num_native == num_loops > 2 * max(map(len, row.lines_back))
 
 
+@pytest.mark.codegen
 @pytest.mark.parametrize("num_maps", [1, 4, 5, 9])
 def test_a_cpu_finds_statistics_in_native_loops(num_maps):
     find = jax.jit(selection.find_statistics, static_argnames="max_components")
