@@ -1,4 +1,4 @@
-"""What the benchmarks share: where the data is, which settings, what a report says of its circumstances."""
+"""Shared by the programs of `benchmarks` and `quality`: data, settings, and the circumstances of a report."""
 
 import argparse
 import importlib.metadata
@@ -111,7 +111,7 @@ def circumstances(options: argparse.Namespace) -> dict[str, Any]:
     return {
         "options": chosen,
         "commit": _git("rev-parse", "HEAD"),
-        "uncommitted_changes": bool(_git("status", "--porcelain", "--", "jaxbox", "benchmarks")),
+        "uncommitted_changes": bool(_git("status", "--porcelain", "--", "jaxbox", "benchmarks", "quality")),
         "jaxbox": jaxbox.__version__,
         "python": platform.python_version(),
         "packages": {name: installed_version(name) for name in PACKAGES},

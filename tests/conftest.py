@@ -14,6 +14,25 @@ from jaxbox import devices
 
 DATA = pathlib.Path(os.environ.get("JAXBOX_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
 
+FAST = {
+    "test_ablation.py", "test_config.py", "test_conventions.py", "test_docs.py", "test_evaluation_beams.py",
+    "test_evaluation_corruptions.py", "test_evaluation_iou.py", "test_evaluation_kitti.py",
+    "test_evaluation_objectives.py", "test_evaluation_report.py", "test_evaluation_sizes.py",
+    "test_fuzz_readers.py", "test_geometry.py", "test_hostile_files.py", "test_io_drives.py",
+    "test_io_files.py", "test_io_formats.py", "test_io_kitti.py", "test_io_other_sensors.py",
+    "test_packaging.py", "test_paper_table.py", "test_reference.py", "test_reliability_benchmarks.py",
+    "test_sensors_benchmark.py", "test_settings.py", "test_speed_benchmarks.py", "test_synthetic.py",
+    "test_tuning.py", "test_types.py", "test_viz.py", "test_viz_judged.py",
+}  # fmt: skip
+"""Files whose tests make up ``pytest -m fast``, but for the tests in `SLOW`."""
+SLOW = {
+    "rounds",
+    "test_the_proposed_capacities_hold_the_sweeps_they_were_proposed_for",
+    "test_the_readme_python_example_runs",
+    "test_the_rough_look_at_real_sweeps_proposes_enough",
+}
+"""Tests and fixtures that compile the whole detector, or go through many real sweeps."""
+
 
 # The same few examples each time; `--hypothesis-profile=long` draws many new ones.
 _options = {"deadline": None, "database": None, "suppress_health_check": list(hypothesis.HealthCheck)}
@@ -33,6 +52,15 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ["JAXBOX_CACHE_DIR"] = ""
     # Two, so that work over several devices can be tested; the first is the default as ever.
     jax.config.update("jax_num_cpu_devices", 2)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks the fast tests."""
+    for item in items:
+        # Doctests have no fixtures.
+        names = {getattr(item, "originalname", item.name), *getattr(item, "fixturenames", ())}
+        if item.path.name in FAST and not names & SLOW:
+            item.add_marker(pytest.mark.fast)
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -1,6 +1,6 @@
 """Bad input: no exception, finite answers, the right bits, every point in its place, and no box from nothing.
 
-The inputs and the laws are in `benchmarks.bad_input`, from which the documentation's table is made too.
+The inputs and the laws are in `quality.bad_input`, from which the documentation's table is made too.
 """
 
 import functools
@@ -10,13 +10,14 @@ import jax
 import numpy as np
 import pytest
 
-from benchmarks import bad_input, bench_bad_input, common
+from benchmarks import common
 from jaxbox import DetectorConfig, PointCloud, Status, detect
 from jaxbox.types import GROUND_ABOVE_M
+from quality import bad_input, bad_input_table
 
 CASES = {case.name: case for case in bad_input.CASES}
 HERE = [case.name for case in bad_input.CASES if not case.compiles_anew]
-"""The others compile the whole detector anew, and are run by `bench_bad_input`."""
+"""The others compile the whole detector anew, and are run by `bad_input_table`."""
 
 
 @functools.cache
@@ -82,7 +83,7 @@ def test_a_box_from_nothing_and_a_lost_point_are_noticed():
 
 
 def test_the_recorded_table_holds_every_case_and_no_broken_law():
-    recorded = json.loads((common.PROJECT / "benchmarks" / "results" / "bad_input.json").read_text())
+    recorded = json.loads((common.PROJECT / "quality" / "results" / "bad_input.json").read_text())
     answers = recorded["answers"]
     assert {group: list(cases) for group, cases in answers.items()} == {
         group: [case.name for case in cases] for group, cases in bad_input.GROUPS.items()
@@ -93,4 +94,4 @@ def test_the_recorded_table_holds_every_case_and_no_broken_law():
                 row = answers[group][case.name][preset]
                 assert row["broken"] == []
                 assert row["status"] == common.status_names([int(case.status[preset])])
-    assert recorded["refused"] == bench_bad_input.refusals()
+    assert recorded["refused"] == bad_input_table.refusals()

@@ -384,6 +384,17 @@ def test_demo_writes_a_picture_a_stage_and_compares_every_vehicle(tmp_path, monk
     assert len(rows) == demo.NUM_VEHICLES
 
 
+def test_the_picture_of_the_documentation_is_of_this_detector(tmp_path):
+    result = run("demo", "--output", tmp_path)
+    assert result.exit_code == 0, result.output
+    drawn = read_image(tmp_path / "5_boxes.png")
+    shown = read_image(pathlib.Path(__file__).parents[1] / "docs" / "demo.png")
+    assert drawn.shape == shown.shape
+    # Another processor rounds otherwise, which may move an edge by a pixel; a box more or less is .15 %.
+    differing = np.any(drawn != shown, axis=-1).mean()
+    assert differing < 0.001, "jaxbox demo --output out && cp out/5_boxes.png docs/demo.png"
+
+
 def test_a_table_of_perfect_boxes_has_no_errors():
     sweep = make_small_sweep(3)
     truth = sweep.boxes

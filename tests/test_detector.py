@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from test_masked import count_loops
 
-from benchmarks import bad_input
 from jaxbox import DetectorConfig, PointCloud, Status, detect, detector, devices, stack_clouds, synthetic
 from jaxbox.config import BoxConfig, EvidenceConfig
 from jaxbox.geometry import rectangle_iou
 from jaxbox.io import open_sweeps
+from quality import bad_input
 
 CAPACITY = 2**14
 SEEDS = range(5)
@@ -110,6 +110,7 @@ def test_nothing_calls_back_to_the_host():
 # The same answer.
 
 
+@pytest.mark.codegen
 @pytest.mark.parametrize("preset", DetectorConfig.presets().values())
 def test_thresholds_go_in_as_one_array_that_native_loops_cut_up(preset):
     settings = detector.PackedSettings.pack(preset, accelerator=False)

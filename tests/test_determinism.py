@@ -1,4 +1,4 @@
-"""The same bits every time, other keys, and a soak: the short versions of the two benchmarks."""
+"""The same bits every time, other keys, and a soak: the short versions of both programs."""
 
 import dataclasses
 
@@ -7,23 +7,23 @@ import pytest
 from test_detector import CAPACITY, found, run, street
 
 import jaxbox
-from benchmarks import bench_determinism, bench_soak
 from jaxbox import DetectorConfig, detector
+from quality import determinism, soak
 
 BOX = np.array([10.0, 2, -1, 4, 1.8, 1.5, 0.1, 0.5])
 
 
 def test_a_hundred_repeats_have_the_same_bits():
-    sweeps = [bench_determinism.Given(f"street {seed}", street(seed).xyz) for seed in range(2)]
-    assert bench_determinism.repeat(sweeps, DetectorConfig(), 100) == 0
-    assert bench_determinism.digests(sweeps, DetectorConfig()) == [
-        bench_determinism.digest(found(seed)) for seed in range(2)
+    sweeps = [determinism.Given(f"street {seed}", street(seed).xyz) for seed in range(2)]
+    assert determinism.repeat(sweeps, DetectorConfig(), 100) == 0
+    assert determinism.digests(sweeps, DetectorConfig()) == [
+        determinism.digest(found(seed)) for seed in range(2)
     ]
 
 
 def test_a_digest_tells_one_bit_a_shape_and_a_type():
     answer = found(0)
-    digest = bench_determinism.digest
+    digest = determinism.digest
     last_bit = np.nextafter(answer.score, np.float32(1), dtype=np.float32)
     others = [
         dataclasses.replace(answer, score=score)
@@ -33,20 +33,18 @@ def test_a_digest_tells_one_bit_a_shape_and_a_type():
 
 
 def test_another_process_has_the_same_bits():
-    options = bench_determinism.common.parser("", preset=False, quick="small").parse_args(["--quick"])
-    expected = [bench_determinism.digest(found(seed)) for seed in range(bench_determinism.NUM_SWEEPS)]
-    assert bench_determinism.by_process({"NPROC": "1"}, options, "default") == expected
+    options = determinism.common.parser("", preset=False, quick="small").parse_args(["--quick"])
+    expected = [determinism.digest(found(seed)) for seed in range(determinism.NUM_SWEEPS)]
+    assert determinism.by_process({"NPROC": "1"}, options, "default") == expected
 
 
 def test_boxes_of_other_keys_are_followed_to_the_object_they_are_of():
     there, beside = BOX.copy(), BOX + np.array([30, 0, 0, 0, 0, 0, 0, 0])
     turned = BOX + np.array([0.1, 0, 0, 0, 0, 0, np.pi - 0.02, -0.1])
-    objects = bench_determinism.follow_objects(
-        [np.stack([there]), np.stack([turned, beside]), np.zeros((0, 8))]
-    )
+    objects = determinism.follow_objects([np.stack([there]), np.stack([turned, beside]), np.zeros((0, 8))])
     assert objects.shape == (2, 3, 8)
     np.testing.assert_array_equal(~np.isnan(objects[..., 0]), [[True, True, False], [False, True, False]])
-    moves = bench_determinism.deviations(objects[0, :2])
+    moves = determinism.deviations(objects[0, :2])
     # Two boxes are half their difference from their median; half a turn is no turn.
     assert moves["centre, m"] == pytest.approx([0.05, 0.05])
     assert moves["yaw, degrees"] == pytest.approx(np.degrees([0.01, 0.01]))
@@ -54,7 +52,7 @@ def test_boxes_of_other_keys_are_followed_to_the_object_they_are_of():
 
 
 def test_clear_vehicles_are_there_with_every_key():
-    spread = bench_determinism.spread_over_keys([("street", street(0).xyz)], DetectorConfig(), 8)
+    spread = determinism.spread_over_keys([("street", street(0).xyz)], DetectorConfig(), 8)
     assert spread["objects"] > 0
     clear = spread["by_median_score"]["0.3 to 1"]
     assert clear["objects"] == clear["with_every_key_at_some_score"]
@@ -64,9 +62,9 @@ def test_clear_vehicles_are_there_with_every_key():
 def test_a_soak_of_small_sweeps_of_any_size_recompiles_nothing_and_loses_no_point():
     run(street(0).xyz)
     programs = detector.count_compilations()
-    sweeps = bench_soak.varied_sweeps(street(0).xyz, CAPACITY, 200)
+    sweeps = soak.varied_sweeps(street(0).xyz, CAPACITY, 200)
     assert {0, 1, CAPACITY} <= {sweep.size for sweep in sweeps}
-    report = bench_soak.soak(sweeps, sweeps[:1], DetectorConfig(), CAPACITY)
+    report = soak.soak(sweeps, sweeps[:1], DetectorConfig(), CAPACITY)
     assert (report["frames"], report["recompiles"], report["points"]["least"]) == (200, 0, 0)
     assert report["points"]["most"] == CAPACITY
     assert detector.count_compilations() == programs
@@ -76,7 +74,7 @@ def test_a_soak_of_small_sweeps_of_any_size_recompiles_nothing_and_loses_no_poin
 def test_a_soak_ends_where_a_sweep_fails_and_the_slope_is_that_of_the_memory():
     failed = jaxbox.StreamedSweep("bad", 0, None, "the disk is gone")
     with pytest.raises(SystemExit, match="bad: the disk is gone"):
-        bench_soak._check(failed)
+        soak._check(failed)
     memory = [(frame, 500_000 + (0 if frame < 100 else 2 * frame)) for frame in range(0, 1000, 10)]
-    assert bench_soak.growth(memory, 1000)["growth_kb_per_1000_frames"] == pytest.approx(2000)
-    assert bench_soak.latency(range(1001))["p99.9"] == pytest.approx(999)
+    assert soak.growth(memory, 1000)["growth_kb_per_1000_frames"] == pytest.approx(2000)
+    assert soak.latency(range(1001))["p99.9"] == pytest.approx(999)

@@ -20,6 +20,7 @@ def text_for(platform, preset="default"):
     return detector.lower(cloud, DetectorConfig.presets()[preset], platform=platform).as_text()
 
 
+@pytest.mark.codegen
 @pytest.mark.parametrize("preset", sorted(DetectorConfig.presets()))
 def test_the_program_for_accelerators_hardly_waits_for_its_host(preset):
     # The host of a GPU waits at each turn of a loop, and at each conditional.
@@ -28,11 +29,13 @@ def test_the_program_for_accelerators_hardly_waits_for_its_host(preset):
     assert text.count("stablehlo.case") == text.count("stablehlo.if") == 0
 
 
+@pytest.mark.codegen
 def test_the_program_for_a_cpu_is_another_one():
     assert text_for("cpu").count("stablehlo.while") > 50
     assert text_for("cpu") == text_for(None)
 
 
+@pytest.mark.codegen
 def test_what_is_lowered_for_cuda_on_a_cpu_has_no_form_of_a_cpu():
     # Barriers keep walls up and loops of one turn alive: forms that a CPU alone has.
     text = text_for("cuda")

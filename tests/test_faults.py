@@ -47,9 +47,9 @@ def names_of(folder):
 
 @pytest.fixture
 def faults(monkeypatch):
-    """The benchmark, whose short version this is."""
+    """The program whose short version this is."""
     monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parents[1]))
-    return importlib.import_module("benchmarks.bench_faults")
+    return importlib.import_module("quality.faults")
 
 
 # --- killed -----------------------------------------------------------------------------------------

@@ -12,12 +12,12 @@ from jaxbox import io
 
 PROJECT = pathlib.Path(__file__).parents[1]
 sys.path.insert(0, str(PROJECT))
-fuzz_targets = importlib.import_module("benchmarks.fuzz_targets")
+fuzz_targets = importlib.import_module("quality.fuzz_targets")
 sys.path.remove(str(PROJECT))
 
 TARGETS = fuzz_targets.TARGETS
 COPIES = 25
-"""Changed copies a reader; `python -m benchmarks.fuzz_readers` makes as many as there is time for."""
+"""Changed copies a reader; `python -m quality.fuzz_readers` makes as many as there is time for."""
 CORPUS = pathlib.Path(__file__).parent / "corpus"
 FOUND = sorted(path for path in CORPUS.glob("*/*"))
 

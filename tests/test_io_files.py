@@ -161,11 +161,12 @@ def test_object_sweep_without_image_has_the_usual_size(data_root):
 @pytest.mark.parametrize("below", ["", "training", "training/velodyne", "training/velodyne/0000"])
 def test_tracking_layout_is_found_from_any_folder(data_root, below):
     sweeps = io.open_sweeps(data_root / "kitti_tracking" / below)
-    assert [sweep.name for sweep in sweeps] == [f"0000_{frame:06d}" for frame in range(48)]
-    assert {item.frame for item in sweeps[12].read_labels()} == {12}
+    first_drive = [sweep for sweep in sweeps if sweep.name.startswith("0000_")]
+    assert [sweep.name for sweep in first_drive] == [f"0000_{frame:06d}" for frame in range(48)]
+    assert {item.frame for item in first_drive[12].read_labels()} == {12}
     # 218 lines in the file, all of them of these 48 frames.
-    assert sum(len(sweep.read_labels()) for sweep in sweeps) == 218
-    assert sweeps[12].read_calibration() is not None
+    assert sum(len(sweep.read_labels()) for sweep in first_drive) == 218
+    assert first_drive[12].read_calibration() is not None
 
 
 DRIVE = "2011_09_26/2011_09_26_drive_0052_sync"

@@ -16,7 +16,6 @@ from hypothesis.extra.numpy import arrays
 from test_detector import CAPACITY, assert_same_bits, run
 from test_projection import make_calibration, oracle_uvw
 
-from benchmarks import bad_input
 from jaxbox import DetectorConfig, PointCloud, Status, detect, detect_batch, io, stack_clouds, synthetic
 from jaxbox.box import PointLists, best_rectangles, try_rotations
 from jaxbox.evaluation import pairwise_overlaps
@@ -24,6 +23,7 @@ from jaxbox.hull import convex_hulls, polygon_area
 from jaxbox.io.kitti import KittiObject
 from jaxbox.projection import project_boxes
 from jaxbox.settings import settings_from_toml, settings_to_toml
+from quality import bad_input
 
 SWEEPS = settings(max_examples=max(settings.default.max_examples // 5, 1))
 """A sweep takes longer than a cluster."""

@@ -50,6 +50,7 @@ def count_loops(function, *args, **options):
     return text.count(" while("), text.count('xla_cpu_small_call="true"')
 
 
+@pytest.mark.codegen
 @pytest.mark.parametrize(
     "toolbox",
     [
@@ -65,6 +66,7 @@ def test_a_cpu_runs_the_toolbox_in_native_loops(toolbox):
     assert count_loops(jax.jit(toolbox), jnp.zeros(1000, jnp.int32)) == (1, 1)
 
 
+@pytest.mark.codegen
 def test_at_once_copies_numbers_in_one_native_loop():
     values = jnp.arange(float(loops.AT_ONCE))
 
@@ -146,6 +148,7 @@ def test_count_true_counts_every_mask_also_where_all_are_true(size):
     assert masked.count_true(*map(jnp.asarray, masks)).tolist() == [mask.sum() for mask in masks]
 
 
+@pytest.mark.codegen
 @pytest.mark.parametrize("wall", ["store", "apart", "none"])
 def test_what_stands_behind_a_wall_is_computed_once_for_all_who_read_it(wall, platform):
     walls = {"store": lambda x: loops.store(jnp.sin(x)), "apart": lambda x: loops.apart(jnp.sin, x)}

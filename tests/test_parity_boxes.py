@@ -271,6 +271,7 @@ def test_what_a_list_holds_beyond_its_end_joins_no_cluster():
     assert expected[:, 0].sum() == num
 
 
+@pytest.mark.codegen
 def test_a_cpu_describes_clusters_in_native_loops():
     rows = jnp.zeros(900, jnp.int32), jnp.zeros(900, jnp.int32), jnp.int32(9), jnp.zeros((1000, 2))
     assert count_loops(find_bounds.jitted, *rows) == (1, 1)

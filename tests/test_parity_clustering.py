@@ -241,6 +241,7 @@ def test_counts_of_words_are_summed_up_strip_after_strip_on_every_platform(num_s
     assert int(total) == count.sum()
 
 
+@pytest.mark.codegen
 @pytest.mark.parametrize("name", SHAPES)
 def test_a_cpu_joins_runs_in_native_loops(name):
     row = clustering.CellRow(SHAPES[name])
@@ -249,6 +250,7 @@ def test_a_cpu_joins_runs_in_native_loops(name):
     assert num_native == num_loops > 2 * max(map(len, row.lines_back))
 
 
+@pytest.mark.codegen
 @pytest.mark.parametrize("num_maps", [1, 4, 5, 9])
 def test_a_cpu_finds_statistics_in_native_loops(num_maps):
     find = jax.jit(selection.find_statistics, static_argnames="max_components")

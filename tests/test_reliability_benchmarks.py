@@ -1,4 +1,4 @@
-"""The benchmarks of corruption, mutants and coverage: their logic, and that what is recorded fits it."""
+"""Corruption, mutants and coverage: the logic of their programs, and that what is recorded fits it."""
 
 import json
 import pathlib
@@ -9,11 +9,12 @@ import tomllib
 import numpy as np
 import pytest
 
-from benchmarks import bench_corruption, bench_mutation, coverage_table
+from benchmarks import bench_corruption
 from jaxbox import synthetic
 from jaxbox.evaluation.copies import Frame
 from jaxbox.evaluation.corruptions import CORRUPTIONS
 from jaxbox.io import KittiObject, read_image
+from quality import coverage_table, mutation
 
 RESULTS = pathlib.Path(__file__).parents[1] / "benchmarks" / "results"
 
@@ -82,18 +83,18 @@ def test_survivors_are_found_again_and_other_modules_are_kept(tmp_path):
     path = tmp_path / "mutation.json"
     modules = {"a.py": {"run": 2}, "b.py": {"run": 1}}
     path.write_text(json.dumps({"modules": modules, "survivors": [mutant("a.py", 3), mutant("b.py", 5)]}))
-    assert bench_mutation.survivors_of(path) == {
+    assert mutation.survivors_of(path) == {
         "a.py": frozenset({("core/AddNot", 3)}),
         "b.py": frozenset({("core/AddNot", 5)}),
     }
-    kept = bench_mutation.earlier_report(path, ["a.py"])
+    kept = mutation.earlier_report(path, ["a.py"])
     assert kept == {"modules": {"b.py": {"run": 1}}, "survivors": [mutant("b.py", 5)]}
-    assert bench_mutation.earlier_report(tmp_path / "none.json", []) == {"modules": {}, "survivors": []}
+    assert mutation.earlier_report(tmp_path / "none.json", []) == {"modules": {}, "survivors": []}
 
 
 def test_every_mutated_module_and_its_tests_exist():
     root = RESULTS.parents[1]
-    for module, arguments in bench_mutation.TESTS.items():
+    for module, arguments in mutation.TESTS.items():
         assert (root / module).is_file()
         files = [word for word in arguments.split() if word.endswith(".py")]
         assert files
@@ -126,14 +127,14 @@ def test_coverage_is_summed_by_part():
     assert list(coverage_table.uncovered(files)) == ["jaxbox/io/a.py"]
 
 
-@pytest.mark.parametrize("module", sorted(bench_mutation.TESTS))
+@pytest.mark.parametrize("module", sorted(mutation.TESTS))
 def test_the_command_of_a_module_is_one_shell_line_with_a_limit_of_time(module, tmp_path):
-    bench_mutation.write_config(module, tmp_path / "config.toml")
+    mutation.write_config(module, tmp_path / "config.toml")
     settings = tomllib.loads((tmp_path / "config.toml").read_text())["cosmic-ray"]
     shell, flag, line = shlex.split(settings["test-command"])
     assert (shell, flag) == ("bash", "-c")
     limit, tests = line.split("; exec ")
-    assert limit == f"ulimit -t {bench_mutation.MAX_CPU_S}"
+    assert limit == f"ulimit -t {mutation.MAX_CPU_S}"
     assert shlex.split(tests)[1:3] == ["-m", "pytest"]
-    assert shlex.split(tests)[-1] in bench_mutation.TESTS[module].replace("'", "")
+    assert shlex.split(tests)[-1] in mutation.TESTS[module].replace("'", "")
     subprocess.run([shell, "-n", flag, line], check=True)

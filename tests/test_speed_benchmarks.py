@@ -155,7 +155,7 @@ def test_the_report_of_a_cluster_fills_the_tables_of_its_page(benchmark, tmp_pat
     assert "1e+09" in capsys.readouterr().out
     hook = load_hook()
     assert "sweeps a second and worker" in hook.cluster()
-    hook.RESULTS = tmp_path
+    hook.RESULTS = {"cluster": tmp_path / "cluster.json"}
     page = hook.on_page_markdown("<!-- table: cluster -->\n<!-- table: archives -->")
     assert "| read, MB a sweep | 0.002 |" in page
     assert "| 1,000,000,000 | 138.9 |" in page

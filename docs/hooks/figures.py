@@ -12,7 +12,12 @@ import jaxbox
 from jaxbox.evaluation.corruptions import CORRUPTIONS
 from jaxbox.types import Counts, Status
 
-RESULTS = pathlib.Path(__file__).parents[2] / "benchmarks" / "results"
+PROJECT = pathlib.Path(__file__).parents[2]
+RESULTS = {
+    path.stem: path
+    for folder in ("benchmarks", "quality")
+    for path in (PROJECT / folder / "results").glob("*.json")
+}
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
@@ -22,7 +27,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 def load(name: str) -> dict[str, Any]:
     """One of the recorded results."""
-    return json.loads((RESULTS / f"{name}.json").read_text("utf-8"))
+    return json.loads(RESULTS[name].read_text("utf-8"))
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -454,6 +459,54 @@ def soak_sizes() -> str:
     return table(["capacity", *(f"{name}, ms" for name in report["frame_ms"])], rows)
 
 
+def settings() -> str:
+    """Every setting of the default preset: a table a stage."""
+    config, parts = jaxbox.DetectorConfig(), []
+    for field in dataclasses.fields(config):
+        stage = getattr(config, field.name)
+        rows = setting_rows(stage, field.name)
+        parts += [f"## `{field.name}`", summary(type(stage)), table(SETTING_COLUMNS, rows)]
+    return "\n\n".join(parts)
+
+
+SETTING_COLUMNS = ("setting", "default", "unit", "kind", "meaning")
+UNITS = {"_m": "m", "_deg": "degrees", "_grade": "m/m"}
+"""By the last part of a name."""
+
+
+def summary(node: type) -> str:
+    """The first paragraph of a docstring."""
+    return " ".join((inspect.getdoc(node) or "").split("\n\n")[0].split())
+
+
+def setting_rows(node: Any, prefix: str) -> list[tuple[str, ...]]:
+    """Rows of a stage; the items of a list, such as the component maps, share theirs."""
+    # Under each field stands a string, which only the source has.
+    texts = dict(
+        re.findall(
+            r'^    (\w+): (?:(?!^    \w+:).)*?^    """(.*?)"""',
+            inspect.getsource(type(node)),
+            re.MULTILINE | re.DOTALL,
+        )
+    )
+    rows: list[tuple[str, ...]] = []
+    for field in dataclasses.fields(node):
+        name, value = f"{prefix}.{field.name}", getattr(node, field.name)
+        if isinstance(value, tuple):
+            tables = [setting_rows(item, f"{name}.N") for item in value]
+            rows += [
+                (first, ", ".join(dict.fromkeys(row[1] for row in same)), *rest)
+                for same in zip(*tables, strict=True)
+                for first, _, *rest in same[:1]
+            ]
+            continue
+        unit = next((unit for end, unit in UNITS.items() if field.name.endswith(end)), "")
+        kind = "static" if field.metadata.get("static") else "traced"
+        meaning = " ".join(texts[field.name].split()).removeprefix("static: ")
+        rows.append((f"`{name}`", f"`{value}`", unit, kind, meaning.replace("|", "\\|")))
+    return rows
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "accuracy": accuracy,
     "sizes": sizes,
@@ -486,4 +539,5 @@ TABLES: dict[str, Callable[[], str]] = {
     "moves": moves,
     "soak": soak,
     "soak_sizes": soak_sizes,
+    "settings": settings,
 }

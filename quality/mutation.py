@@ -1,7 +1,7 @@
 """Mutation testing of the geometry: how many small errors, put in one at a time, do the tests notice?
 
-    python -m benchmarks.bench_mutation [--modules hull box] [--sample 60] [--json FILE]
-    python -m benchmarks.bench_mutation --again FILE    # only the mutants that survived then
+    python -m quality.mutation [--modules hull box] [--sample 60] [--json FILE]
+    python -m quality.mutation --again FILE    # only the mutants that survived then
 
 Cosmic Ray (`pip install 'jaxbox[quality]'`) changes a sign, a number, a comparison or a condition in a copy
 of the tracked files; the checkout is not touched. A mutant is killed where the fast tests of its module fail,

@@ -1,6 +1,6 @@
 """Fuzzing of every reader of `jaxbox.io`: only documented errors, no hang, bounded memory.
 
-    python -m benchmarks.fuzz_readers [--reader NAME ...] [--minutes 10] [--folder DIR] [--json FILE]
+    python -m quality.fuzz_readers [--reader NAME ...] [--minutes 10] [--folder DIR] [--json FILE]
 
 libFuzzer, by way of Atheris (``pip install atheris``, not a dependency), changes small files that the
 formats' own libraries wrote (`fuzz_targets`), and keeps what reaches new code of the reader or its library.
@@ -41,7 +41,7 @@ except ImportError as missing:
 # Only what is imported here is watched, so nothing of the readers may come before.
 with atheris.instrument_imports(include=WATCHED, exclude=UNWATCHED):
     from benchmarks import common
-    from benchmarks.fuzz_targets import TARGETS, Target, prepared
+    from quality.fuzz_targets import TARGETS, Target, prepared
 
 MEMORY_BYTES = 2**31
 """What a reader may take beyond the libraries themselves, for a file of at most `MAX_FILE_BYTES`."""

@@ -1,6 +1,6 @@
 """What a killed `jaxbox detect` leaves behind, and whether a resumed run ends with the same results.
 
-    python -m benchmarks.bench_faults [--kills 50] [--sweeps 4] [--json FILE]
+    python -m quality.faults [--kills 50] [--sweeps 4] [--json FILE]
 
 A run over synthetic sweeps is killed (SIGKILL) at random moments from its start to its end, and the same
 command with ``--resume`` is started over and over, until it was killed so often, and then left alone.

@@ -1,8 +1,8 @@
 """Bad input, as one table: what went in, what came out, and whether the laws of every answer held.
 
-    python -m benchmarks.bench_bad_input --json benchmarks/results/bad_input.json
+    python -m quality.bad_input_table --json quality/results/bad_input.json
 
-The inputs and the laws are those of `benchmarks.bad_input`. `tests/test_bad_input.py` holds them in the
+The inputs and the laws are those of `quality.bad_input`. `tests/test_bad_input.py` holds them in the
 suite, all but those that would compile programs of their own. It ends with exit code 1 where a law is broken.
 """
 
@@ -15,10 +15,11 @@ from typing import Any
 import jax
 
 import jaxbox
-from benchmarks import bad_input, common
+from benchmarks import common
 from jaxbox import DetectorConfig, PointCloud, Status
 from jaxbox.settings import replace_settings
 from jaxbox.types import NUM_POINT_COUNTS
+from quality import bad_input
 
 
 def answer(case: bad_input.Case, preset: str, base: DetectorConfig) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Input that nobody would wish for, and what has to hold of the answer to any of it.
 
-`CASES` is the one list: `tests/test_bad_input.py` runs it, and `bench_bad_input` writes the documentation's
+`CASES` is the one list: `tests/test_bad_input.py` runs it, and `bad_input_table` writes the documentation's
 table from it. `REFUSED` is what never reaches the compiled function, with the error that says so.
 """
 

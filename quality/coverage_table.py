@@ -1,11 +1,11 @@
 """Line and branch coverage of the test suite by part of the package, from coverage's own report.
 
     coverage run -m pytest && coverage combine && coverage json
-    python -m benchmarks.coverage_table coverage.json --json benchmarks/results/coverage.json
+    python -m quality.coverage_table coverage.json --json quality/results/coverage.json
 
 A part is a module or folder of `jaxbox`. What a kernel does is covered where it is traced: coverage says that
 a line was compiled by some test, not that its numbers were looked at; mutation testing asks that, see
-`bench_mutation`.
+`mutation`.
 """
 
 import argparse

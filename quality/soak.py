@@ -1,6 +1,6 @@
 """A soak: thousands of sweeps through `jaxbox.stream`; recompiles, memory, and the slowest frames.
 
-    python -m benchmarks.bench_soak --json benchmarks/results/soak.json
+    python -m quality.soak --json quality/results/soak.json
 
 Two runs in processes of their own: the real sweeps over and over, at one capacity; and sweeps of wildly
 varying size, from none to a million points, over all capacity buckets. After a warm-up, in which each
@@ -24,10 +24,10 @@ import numpy as np
 
 import jaxbox
 from benchmarks import common
-from benchmarks.bad_input import street
 from jaxbox import DetectorConfig, detector
 from jaxbox.io import open_sweeps
 from jaxbox.padding import CAPACITY_BUCKETS, fitting_capacity
+from quality.bad_input import street
 
 FRAMES, QUICK_FRAMES = 20_000, 200
 SIZE_FRAMES = 2_000

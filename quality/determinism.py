@@ -1,6 +1,6 @@
 """The same bits: repeated, in other processes, with other threads, in batches; and what another key changes.
 
-    python -m benchmarks.bench_determinism --json benchmarks/results/determinism.json
+    python -m quality.determinism --json quality/results/determinism.json
 
 Each answer is reduced to a digest of all its arrays. RANSAC draws its planes by a random key, so another key
 may give other boxes: how much they move is measured over many keys on every real sweep.
@@ -21,10 +21,10 @@ import numpy as np
 
 import jaxbox
 from benchmarks import bench_sensors, common
-from benchmarks.bad_input import PRESETS, street
 from jaxbox import Detections, DetectorConfig, PointCloud
 from jaxbox.evaluation import pairwise_overlaps
 from jaxbox.workers import THREADS_VARIABLE
+from quality.bad_input import PRESETS, street
 
 REPEATS, QUICK_REPEATS = 100, 10
 KEYS, QUICK_KEYS = 50, 5
@@ -134,7 +134,7 @@ def _streamed(result: jaxbox.StreamedSweep) -> str:
 
 def by_process(environment: Mapping[str, str], options: argparse.Namespace, preset: str) -> list[str]:
     """Digests of the sweeps from a process of its own."""
-    command = [sys.executable, "-m", "benchmarks.bench_determinism", "--digests-of", preset]
+    command = [sys.executable, "-m", "quality.determinism", "--digests-of", preset]
     command += ["--quick"] if options.quick else []
     command += [word for change in options.set for word in ("--set", change)]
     done = subprocess.run(

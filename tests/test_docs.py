@@ -1,0 +1,84 @@
+"""The documentation's hooks: what they make of docstrings and pages."""
+
+import importlib.util
+import pathlib
+import re
+
+import pytest
+
+import jaxbox
+from jaxbox import DetectorConfig, settings
+
+PROJECT = pathlib.Path(__file__).parents[1]
+
+
+def hook(name):
+    """A module of docs/hooks, which is no package."""
+    spec = importlib.util.spec_from_file_location(f"docs_{name}", PROJECT / "docs" / "hooks" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def fence_doctests(text):
+    pytest.importorskip("griffe", reason="pip install '.[docs]'")
+    return hook("doctests").fence_doctests(text)
+
+
+def test_each_doctest_has_a_fence_of_its_own():
+    text = 'Says.\n\n>>> a = [1]\n>>> [b for b in a][0]\n1\n\nMore.\n\n  >>> f("\n  ... ")\n  2'
+    fenced = (
+        "Says.\n\n```pycon\n>>> a = [1]\n>>> [b for b in a][0]\n1\n```\n\n"
+        'More.\n\n  ```pycon\n  >>> f("\n  ... ")\n  2\n  ```'
+    )
+    assert fence_doctests(text) == fenced
+
+
+@pytest.mark.parametrize("text", ["Says a >>> b.", "Says.\n\nExamples:\n    >>> 1\n    1"])
+def test_no_fence_where_none_is_missing(text):
+    assert fence_doctests(text) == text
+
+
+def rows_of(page):
+    """The cells of each row of its tables."""
+    lines = [line[2:-2] for line in page.splitlines() if line.startswith("| `")]
+    rows = [re.split(r" (?<!\\)\| ", line) for line in lines]
+    return {name.strip("`"): cells for name, *cells in rows}
+
+
+def test_the_page_of_settings_has_every_setting_its_default_and_whether_it_is_traced():
+    config = DetectorConfig()
+    rows = rows_of(hook("figures").settings())
+    traced = settings.traced_settings(config)
+    names = {name: re.sub(r"\.\d+\.", ".N.", name) for name in settings.all_settings(config)}
+    assert set(rows) == set(names.values())
+    for name, value in settings.all_settings(config).items():
+        default, unit, kind, meaning = rows[names[name]]
+        assert f"`{value}`" in default
+        assert kind == ("traced" if name in traced else "static"), name
+        assert (unit == "m") == name.endswith("_m")
+        assert meaning
+
+
+def test_the_page_of_the_api_has_every_public_name():
+    page = (PROJECT / "docs" / "api.md").read_text()
+    missing = [name for name in jaxbox.__all__ if not re.search(rf"jaxbox\.{name}\b", page)]
+    assert not missing, "add them to docs/api.md"
+
+
+METHOD = (PROJECT / "docs" / "method.md").read_text()
+
+
+@pytest.mark.parametrize("formula", re.findall(r"\\[(\[]\s*(.*?)\s*\\[)\]]", METHOD, re.DOTALL))
+def test_every_formula_is_known_to_the_converter(formula):
+    pytest.importorskip("latex2mathml", reason="pip install '.[docs]'")
+    markup = hook("formulas").on_page_content(f'<span class="arithmatex">\\({formula}\\)</span>')
+    assert markup.startswith("<math")
+    assert "\\" not in markup
+
+
+def test_links_of_the_projects_files_lead_within_the_site_or_are_words():
+    pytest.importorskip("mkdocs", reason="pip install '.[docs]'")
+    text = "[a](docs/install.md) [b](CHANGELOG.md) [c](LICENSE) [d](https://e.org)"
+    links = hook("project_pages").with_links_of_the_site(text)
+    assert links == "[a](install.md) [b](changelog.md) c [d](https://e.org)"
