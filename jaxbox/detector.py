@@ -204,9 +204,18 @@ def _decide(cloud: PointCloud, segments: Segments, config: DetectorConfig) -> De
     return apart(steps.conclude, cloud, sweep, heights, obstacles, proposals, fits, candidates, config)
 
 
+def _in_32_bits(cloud: PointCloud) -> PointCloud:
+    """The cloud in its documented types, which with ``jax_enable_x64`` a caller's arrays may not have."""
+    return PointCloud(
+        xyz1=jnp.asarray(cloud.xyz1, jnp.float32),
+        intensity=jnp.asarray(cloud.intensity, jnp.float32),
+        num_points=jnp.asarray(cloud.num_points, jnp.int32),
+    )
+
+
 def _find_vehicles(cloud: PointCloud, settings: _Settings, key: jax.Array) -> Detections:
     with building_for(accelerator=settings.accelerator):
-        config = settings.unpack()
+        cloud, config = _in_32_bits(cloud), settings.unpack()
         return _decide(cloud, _segment(cloud, config, key), config)
 
 
@@ -218,13 +227,13 @@ _detect_jit = jax.jit(_find)
 @jax.jit
 def _segment_jit(cloud: PointCloud, settings: _Settings, key: jax.Array) -> Segments:
     with building_for(accelerator=settings.accelerator):
-        return _segment(cloud, settings.unpack(), key)
+        return _segment(_in_32_bits(cloud), settings.unpack(), key)
 
 
 @jax.jit
 def _decide_jit(cloud: PointCloud, segments: Segments, settings: _Settings) -> Detections:
     with building_for(accelerator=settings.accelerator):
-        return _decide(cloud, segments, settings.unpack())
+        return _decide(_in_32_bits(cloud), segments, settings.unpack())
 
 
 @_find.def_vmap

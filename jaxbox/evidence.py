@@ -341,9 +341,9 @@ def _ray_fan(center: jax.Array, half_l: jax.Array, half_w: jax.Array, yaw: jax.A
     x, y = center[:, 0], center[:, 1]
     u, v = x * cos + y * sin, y * cos - x * sin
     # The azimuths of the corners, from that of the centre on.
-    corner_u = u + jnp.array([-1.0, -1.0, 1.0, 1.0])[:, None] * half_l
-    corner_v = v + jnp.array([-1.0, 1.0, -1.0, 1.0])[:, None] * half_w
-    spread = _arctan2(u * corner_v - v * corner_u, u * corner_u + v * corner_v)
+    to_front, to_left = jnp.array([[-1, -1, 1, 1], [-1, 1, -1, 1]], jnp.float32)[..., None]
+    corner_u, corner_v = u[None] + to_front * half_l[None], v[None] + to_left * half_w[None]
+    spread = _arctan2(u[None] * corner_v - v[None] * corner_u, u[None] * corner_u + v[None] * corner_v)
     low, high = jnp.min(spread, axis=0), jnp.max(spread, axis=0)
     azimuth = _arctan2(y, x) + (low + high) / 2
     along, across = jnp.cos(azimuth - yaw), jnp.sin(azimuth - yaw)
@@ -356,9 +356,10 @@ def _ray_stretches(fan: Fan, num_rays: int) -> tuple[jax.Array, jax.Array, jax.A
     In the box's frame, with the sensor at the origin, the box is |u - u0| < l / 2 and |v - v0| < w / 2: the
     slab test. A ray that leaves before it enters misses.
     """
-    middle, half, along, across, u0, v0, half_l, half_w = fan
+    middle, half, along, across, u0, v0, half_l, half_w = (a[None] for a in fan)
     # A quarter turn at most, as seen from outside the box; from inside, any direction leads out.
-    offset = ((2 * jnp.arange(num_rays) + 1) / num_rays - 1)[:, None] * half
+    place = 2 * jnp.arange(num_rays, dtype=jnp.float32) + 1
+    offset = (place / num_rays - 1)[:, None] * half
     cos, sin = _cos_sin(offset)
     enter_u, leave_u = _slab(u0, along * cos - across * sin, half_l)
     enter_v, leave_v = _slab(v0, across * cos + along * sin, half_w)

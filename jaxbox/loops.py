@@ -218,11 +218,11 @@ def fold_rows(
         return update(state, index, jax.tree.map(lambda a, none: jnp.where(there, a, none), rows, absent))
 
     if on_accelerator():
-        return fold(state, jnp.arange(size), rows)
+        return fold(state, jnp.arange(size, dtype=jnp.int32), rows)
     whole = _whole_chunks(rows, chunk)
 
     def step(start: jax.Array, state: Any) -> Any:
-        index = start.astype(jnp.int32) + jnp.arange(chunk)
+        index = start.astype(jnp.int32) + jnp.arange(chunk, dtype=jnp.int32)
         return fold(
             state, index, jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, start, chunk), whole)
         )
@@ -261,7 +261,7 @@ def fold_points(
       The state after the last point of each cluster.
     """
     capacity = x.shape[0]
-    there = jnp.arange(capacity)[:, None] < count
+    there = jnp.arange(capacity, dtype=jnp.int32)[:, None] < count[None]
     points = jnp.where(there, x, absent[0]), jnp.where(there, y, absent[1])
     if on_accelerator():
         of_point = jax.vmap(functools.partial(update, init))(*points)
@@ -270,7 +270,8 @@ def fold_points(
     unroll = FOLD_UNROLL
 
     def fill(values: jax.Array, value: Any) -> jax.Array:
-        return jnp.concatenate([values, jnp.broadcast_to(value, (-capacity % unroll, values.shape[1]))])
+        more = jnp.broadcast_to(jnp.asarray(value, values.dtype), (-capacity % unroll, values.shape[1]))
+        return jnp.concatenate([values, more])
 
     filled = fill(points[0], absent[0]), fill(points[1], absent[1])
     most = jnp.minimum(jnp.max(count, initial=0), capacity)

@@ -151,8 +151,8 @@ def _owners(
       num: () int32; only the first so many rows count.
     """
     num_detections, num_clusters = valid.shape[0], proposals.num_points.shape[0]
-    rank = jnp.where(valid, jnp.arange(num_detections), num_detections)
-    of_cluster = jnp.full(num_clusters + 1, num_detections).at[kept.cluster].min(rank, mode="drop")
+    rank = jnp.where(valid, jnp.arange(num_detections, dtype=jnp.int32), num_detections)
+    of_cluster = jnp.full(num_clusters + 1, num_detections, jnp.int32).at[kept.cluster].min(rank, mode="drop")
     # No point is inside the box of no detection.
     frame = jnp.pad(kept.frame, ((0, 1), (0, 0)), constant_values=-1)
     best = functools.reduce(jnp.minimum, [lookup(of_cluster, cluster) for cluster in proposals.cluster])
@@ -160,7 +160,7 @@ def _owners(
 
     def own(index: jax.Array) -> jax.Array:
         xy = take(obstacles.xy, index)
-        owner = jnp.full(index.shape, num_detections)
+        owner = jnp.full(index.shape, num_detections, jnp.int32)
         for cluster in proposals.cluster:
             detection = lookup(of_cluster, take(cluster, index, num_clusters))
             x, y, cos, sin, half_length, half_width = jnp.take(frame, detection, axis=0, mode="clip").T
@@ -218,8 +218,8 @@ def _counts(
 def _status(cloud: PointCloud, counts: Counts, heights: Heights, config: DetectorConfig) -> jax.Array:
     settings = config.vehicles
     not_valid = counts.dropped_points + counts.nonfinite_points + counts.out_of_range_points
-    max_clusters = jnp.array([m.max_clusters for m in config.clustering.maps])
-    max_cells = jnp.array([m.max_cells for m in config.clustering.maps])
+    max_clusters = jnp.array([m.max_clusters for m in config.clustering.maps], jnp.int32)
+    max_cells = jnp.array([m.max_cells for m in config.clustering.maps], jnp.int32)
     bits = {
         Status.EMPTY: cloud.num_points == not_valid,
         Status.NONFINITE_POINTS: counts.nonfinite_points > 0,
