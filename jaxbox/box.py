@@ -61,14 +61,15 @@ class PointLists:
           The points, in their order; those beyond the count may be anything finite.
         """
         start, total = take(self.start, cluster), take(self.total, cluster)
+        index = jnp.arange(self.max_points, dtype=jnp.int32)
         if on_accelerator():
             # Cluster by cluster, as the points lie in the lists and as `fold_points` reads them there.
-            row = self._row(start[:, None], total[:, None], jnp.arange(self.max_points))
+            row = self._row(start[:, None], total[:, None], index[None])
             xy = jnp.take(jnp.stack([self.x, self.y], axis=1), row, axis=0, mode="clip")
             x, y = xy[:, :, 0].T, xy[:, :, 1].T
         else:
             # Stored, since what a look-up has to work out first does not vectorise.
-            row = store(self._row(start, total, jnp.arange(self.max_points)[:, None]))
+            row = store(self._row(start[None], total[None], index[:, None]))
             x, y = (jnp.take(values, row, mode="clip") for values in (self.x, self.y))
         return x, y, jnp.minimum(total, self.max_points)
 
@@ -168,9 +169,9 @@ def _extents(clusters: PointTable, cos: jax.Array, sin: jax.Array) -> jax.Array:
 
     x, y, count = clusters
     # A point that is absent is seen as the first once more; a cluster without any has a first one anyhow.
-    nearest = jnp.full((to_x.shape[0], x.shape[1]), -jnp.inf)
+    nearest = jnp.full((to_x.shape[0], x.shape[1]), -jnp.inf, jnp.float32)
     reach = fold_points(x, y, count, nearest, update, absent=(x[0], y[0]), reduce=jnp.max)
-    sign = jnp.array([-1.0, 1.0, -1.0, 1.0])[:, None, None]
+    sign = jnp.array([-1, 1, -1, 1], jnp.float32)[:, None, None]
     return sign * jnp.where(count > 0, reach, 0).reshape(4, -1, x.shape[1])
 
 
@@ -178,7 +179,7 @@ def _along(x: jax.Array, y: jax.Array, to_x: jax.Array, to_y: jax.Array) -> jax.
     # Written alike wherever it is needed, so that it is rounded alike: the outermost point lies on the edge.
     # (With the minus of -sin inside the loop it would be a difference, which rounds otherwise; and sines
     # that are computed twice may differ.)
-    return x * to_x + y * to_y
+    return x[None] * to_x + y[None] * to_y
 
 
 def _absent(num_angles: int) -> tuple[float, float]:
@@ -237,9 +238,9 @@ def _mean_closeness(
         return total + d0 / fast_max(distance(_along(x, y, cos, sin), _along(x, y, minus_sin, cos)), d0)
 
     x, y, count = clusters
-    zero = jnp.zeros((cos.shape[0], x.shape[1]))
+    zero = jnp.zeros((cos.shape[0], x.shape[1]), jnp.float32)
     total = fold_points(x, y, count, zero, update, absent=_absent(cos.shape[0]))
-    return total / jnp.maximum(count, 1)
+    return total / jnp.maximum(count, 1).astype(jnp.float32)[None]
 
 
 def _variance(
@@ -250,15 +251,16 @@ def _variance(
 
     def update(state: tuple[jax.Array, ...], x: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
         du, dv = _to_edge(_along(x, y, cos, sin), u0, u1), _to_edge(_along(x, y, minus_sin, cos), v0, v1)
-        there = jnp.abs(x) < FAR_M / 2
+        there = (jnp.abs(x) < FAR_M / 2)[None]
         along_u = there & (du < dv)
         along_v = there & ~along_u
         nu, su, ssu, nv, sv, ssv = state
         du, dv = jnp.where(along_u, du, 0), jnp.where(along_v, dv, 0)
-        return nu + along_u, su + du, ssu + du**2, nv + along_v, sv + dv, ssv + dv**2
+        num_u, num_v = along_u.astype(jnp.float32), along_v.astype(jnp.float32)
+        return nu + num_u, su + du, ssu + du**2, nv + num_v, sv + dv, ssv + dv**2
 
     x, y, count = clusters
-    zero = jnp.zeros((cos.shape[0], x.shape[1]))
+    zero = jnp.zeros((cos.shape[0], x.shape[1]), jnp.float32)
     nu, su, ssu, nv, sv, ssv = fold_points(x, y, count, (zero,) * 6, update, absent=_absent(cos.shape[0]))
 
     def spread(n: jax.Array, s: jax.Array, ss: jax.Array) -> jax.Array:
@@ -293,12 +295,12 @@ def best_rectangles(
     num_angles = curve.shape[0]
     total = curve + (insistence * preference)[:, None]
     # An argmax does not vectorise; a minimum of integers takes several kernels, one of floats one (XLA, CPU).
-    is_best = total >= jnp.max(total, axis=0)
+    is_best = total >= jnp.max(total, axis=0)[None]
     angle = jnp.arange(num_angles, dtype=jnp.float32)[:, None]
     best = jnp.min(jnp.where(is_best, angle, num_angles - 1), axis=0).astype(jnp.int32)
     u0, u1, v0, v1 = jnp.take_along_axis(extents, best[None, None], axis=1)[:, 0]
     worth = jnp.take_along_axis(curve, best[None], axis=0)[0]
-    angle = best * (math.pi / 2 / num_angles)
+    angle = best.astype(jnp.float32) * (math.pi / 2 / num_angles)
     return Rectangles(jnp.stack([u0, v0, u1, v1, angle, worth + preference[best]], axis=1))
 
 
@@ -328,19 +330,19 @@ def scene_preference(
 
     Reference: oracle `jaxbox.reference.scene_direction`.
     """
-    bins = jnp.arange(num_angles) * (90.0 / num_angles)
+    bins = jnp.arange(num_angles, dtype=jnp.float32) * (90.0 / num_angles)
 
     def closeness(angle_deg: jax.Array) -> jax.Array:
-        difference = (bins - angle_deg[..., None] % 90 + 45) % 90 - 45
+        difference = (bins[None] - angle_deg[:, None] % 90 + 45) % 90 - 45
         return jnp.exp(-((difference / sigma_deg) ** 2))
 
     def add(votes: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
         yaw, power = rows
         return votes + power @ closeness(jnp.rad2deg(yaw))
 
-    power = jnp.minimum(num_points, VOTE_POINTS) * jnp.minimum(extent, VOTE_EXTENT_M)
+    power = jnp.minimum(num_points.astype(jnp.float32), VOTE_POINTS) * jnp.minimum(extent, VOTE_EXTENT_M)
     ballots = yaw, jnp.where(voting, power, 0)
-    votes = jnp.zeros(num_angles)
+    votes = jnp.zeros(num_angles, jnp.float32)
     votes = fold_rows(add, votes, ballots, num_rows=rows_in_use(voting), chunk=VOTE_CHUNK, absent=(0.0, 0.0))
-    direction = bins[jnp.argmax(votes)]
-    return jnp.where(jnp.max(votes) > 0, weight * closeness(direction), 0)
+    direction = bins[jax.lax.argmax(votes, 0, jnp.int32)]
+    return jnp.where(jnp.max(votes) > 0, weight * closeness(direction[None])[0], 0)

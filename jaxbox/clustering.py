@@ -247,12 +247,12 @@ def label_components(flags: jax.Array, row: CellRow, *, max_runs: int) -> Compon
 
 def _pack(flags: jax.Array, num_strips: int) -> jax.Array:
     """(R, S) uint32 words of the flags: word r of strip s holds cells r WORD_BITS and on of that strip."""
+    bit = jnp.arange(WORD_BITS, dtype=jnp.uint32)
     if on_accelerator():
-        bits = flags.reshape(num_strips, STRIP_WORDS, WORD_BITS).astype(jnp.uint32)
-        return jnp.sum(bits << jnp.arange(WORD_BITS, dtype=jnp.uint32), axis=2, dtype=jnp.uint32).T
-    bit = jnp.arange(WORD_BITS, dtype=jnp.uint32)[:, None]
+        rows = flags.reshape(num_strips, STRIP_WORDS, WORD_BITS).astype(jnp.uint32)
+        return jnp.sum(rows << bit[None, None], axis=2, dtype=jnp.uint32).T
     rows = flags.reshape(STRIP_WORDS, WORD_BITS, num_strips).astype(jnp.uint32)
-    return jnp.sum(rows << bit, axis=1, dtype=jnp.uint32)
+    return jnp.sum(rows << bit[None, :, None], axis=1, dtype=jnp.uint32)
 
 
 def _shift(words: jax.Array) -> jax.Array:
@@ -263,10 +263,10 @@ def _shift(words: jax.Array) -> jax.Array:
 
 def _prefix(count: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Sum of the counts (R, S) of all words before each, and of all words."""
-    of_strip = jnp.sum(count, axis=0)
+    of_strip = jnp.sum(count, axis=0, dtype=jnp.int32)
     up_to = prefix_sum(of_strip)
     if on_accelerator():
-        return jnp.cumsum(count, axis=0) - count + (up_to - of_strip), up_to[-1]
+        return jnp.cumsum(count, axis=0) - count + (up_to - of_strip)[None], up_to[-1]
     _, before = jax.lax.scan(lambda before, row: (before + row, before), up_to - of_strip, count)
     return before, up_to[-1]
 
@@ -299,14 +299,15 @@ def _run_at(starts: jax.Array, runs_before: jax.Array, place: Place) -> jax.Arra
 def _starting_cells(starts: jax.Array, runs_before: jax.Array, size: int) -> jax.Array:
     """(size,) int32: the cell at which each run starts; any beyond the last run."""
     words, strips = starts.shape
-    cell = jnp.arange(strips) * STRIP + jnp.arange(words)[:, None] * WORD_BITS
+    strip, word = jnp.arange(strips, dtype=jnp.int32)[None], jnp.arange(words, dtype=jnp.int32)[:, None]
+    cell = strip * STRIP + word * WORD_BITS
     first = jnp.where(starts > 0, runs_before, size)
     cell = jnp.zeros(size, jnp.int32).at[first.reshape(-1)].set(cell.reshape(-1), mode="drop")
     # The first run of each word knows where the word begins; its other runs come next.
     for step in (1, 2, 4, 8):
         cell = jnp.maximum(cell, jnp.pad(cell, (step, 0))[:size])
     word, _ = _place(cell, strips)
-    rank = jnp.arange(size) - jnp.take(runs_before, word, mode="clip")
+    rank = jnp.arange(size, dtype=jnp.int32) - jnp.take(runs_before, word, mode="clip")
     bits = jnp.take(starts, word, mode="clip")
     for k in range(MAX_STARTS - 1):
         bits = jnp.where(rank > k, bits & (bits - 1), bits)

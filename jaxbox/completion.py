@@ -151,7 +151,7 @@ def keep_measured(ways: Ways, *, max_length_m: jax.Array, max_width_m: jax.Array
     Returns:
       Boxes (...); no box where a measured side is too long.
     """
-    certain = jnp.where(fits(ways, max_length_m, max_width_m), CERTAIN, NOT_A_BOX)
+    certain = jnp.where(fits(ways, max_length_m, max_width_m), jnp.float32(CERTAIN), NOT_A_BOX)
     return place(ways, ways.measured, jnp.zeros_like(certain, jnp.int32), certain)
 
 
@@ -179,7 +179,7 @@ def extend_away(
     Returns:
       Boxes (...); no box where a measured side is too long.
     """
-    certain = jnp.where(fits(ways, max_length_m, max_width_m), CERTAIN, NOT_A_BOX)
+    certain = jnp.where(fits(ways, max_length_m, max_width_m), jnp.float32(CERTAIN), NOT_A_BOX)
     sizes = likely_sizes(ways, length_m, width_m, **sides)
     return place(ways, sizes, jnp.zeros_like(certain, jnp.int32), certain)
 
@@ -199,7 +199,7 @@ def place(
       Boxes (...).
     """
     u, across = _extend(ways.along, sizes[0])[0], _extend(ways.across, sizes[1])
-    v = jnp.select([placement == i for i in range(NUM_PLACEMENTS)], across)
+    v = jax.lax.select_n(placement, *across)
     cos, sin = jnp.cos(ways.yaw), jnp.sin(ways.yaw)
     return Boxes(
         center=jnp.stack([cos * u - sin * v, sin * u + cos * v], axis=-1),
@@ -231,8 +231,9 @@ class Hypotheses:
     @property
     def center(self) -> jax.Array:
         """(3, C, 2) m, sensor frame."""
-        cos, sin, v = jnp.cos(self.yaw), jnp.sin(self.yaw), self.v.T
-        return jnp.stack([cos * self.u - sin * v, sin * self.u + cos * v], axis=-1)
+        cos, sin = jnp.cos(self.yaw)[None], jnp.sin(self.yaw)[None]
+        u, v = self.u[None], self.v.T
+        return jnp.stack([cos * u - sin * v, sin * u + cos * v], axis=-1)
 
 
 def hypotheses(ways: Ways, length_m: jax.Array, width_m: jax.Array) -> Hypotheses:
@@ -280,7 +281,7 @@ def point_agreement(
     Returns:
       (3, C) float32: the weighted sum of both.
     """
-    half_l, half_w, box_v = boxes.length / 2, boxes.width / 2, boxes.v.T
+    half_l, half_w, box_v = boxes.length / 2, boxes.width[None] / 2, boxes.v.T
     # The sensor, at the origin, sees the faces on its side of the box; the others are far from all points.
     face_u = jnp.where(jnp.abs(boxes.u) > half_l, -jnp.sign(boxes.u) * half_l, FAR_M)
     face_v = jnp.where(jnp.abs(box_v) > half_w, -jnp.sign(box_v) * half_w, FAR_M)
@@ -288,17 +289,17 @@ def point_agreement(
     cos, sin = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw)
 
     def update(total: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-        u, v = x * cos + y * sin - boxes.u, y * cos - x * sin - box_v
-        out_u, out_v = jnp.abs(u) - half_l, jnp.abs(v) - half_w
+        u, v = x * cos + y * sin - boxes.u, (y * cos - x * sin)[None] - box_v
+        out_u, out_v = (jnp.abs(u) - half_l)[None], jnp.abs(v) - half_w
         inside = (out_u < INSIDE_MARGIN_M) & (out_v < INSIDE_MARGIN_M)
-        to_u = jnp.where(out_v < FACE_OVERHANG_M, jnp.abs(u - face_u), FAR_M)
+        to_u = jnp.where(out_v < FACE_OVERHANG_M, jnp.abs(u - face_u)[None], FAR_M)
         to_v = jnp.where(out_u < FACE_OVERHANG_M, jnp.abs(v - face_v), FAR_M)
         near = NEAR_M / fast_max(fast_min(to_u, to_v), NEAR_M)
-        return total + inside_weight * inside + near_weight * near
+        return total + inside_weight * inside.astype(jnp.float32) + near_weight * near
 
     # Points that are absent are far from all boxes.
     total = fold_points(x, y, count, jnp.zeros_like(box_v), update, absent=(FAR_M, FAR_M))
-    return total / jnp.maximum(count, 1)
+    return total / jnp.maximum(count, 1).astype(jnp.float32)[None]
 
 
 def choose_placement(
@@ -331,10 +332,11 @@ def choose_placement(
     Returns:
       Its placement (C,) int32, the first of equally good ones, and its J (C,) float32.
     """
-    cost = not_away_cost * (jnp.arange(NUM_PLACEMENTS) > 0)[:, None]
+    number = jnp.arange(NUM_PLACEMENTS, dtype=jnp.int32)[:, None]
+    cost = not_away_cost * (number > 0).astype(jnp.float32)
     objective = hit - free_weight * free - free_length_weight * free_length + agreement
-    objective = objective + closeness_weight * worth - cost
+    objective = objective + closeness_weight * worth[None] - cost
     best = jnp.max(objective, axis=0)
     # An argmax does not vectorise (XLA, CPU).
-    placement = jnp.where(objective >= best, jnp.arange(NUM_PLACEMENTS)[:, None], NUM_PLACEMENTS)
+    placement = jnp.where(objective >= best[None], number, NUM_PLACEMENTS)
     return jnp.min(placement, axis=0), best

@@ -36,7 +36,7 @@ def point_moments(
         return total.at[slot].add(values, mode="drop")
 
     absent = size, xy.shape[0]
-    return fold_rows(add, jnp.zeros((size, 6)), (slot, row), num_rows=num_rows, absent=absent)
+    return fold_rows(add, jnp.zeros((size, 6), jnp.float32), (slot, row), num_rows=num_rows, absent=absent)
 
 
 def shape_descriptors(moments: jax.Array, hull_area: jax.Array, num_vertices: jax.Array) -> Descriptors:
@@ -66,7 +66,7 @@ def shape_descriptors(moments: jax.Array, hull_area: jax.Array, num_vertices: ja
         moment_of_inertia=jnp.stack([major, minor], axis=1),
         eccentricity=jnp.sqrt(ratio),
         density=jnp.where(has_area, count / jnp.where(has_area, hull_area, 1), 0),
-        complexity=jnp.where(present, num_vertices / jnp.maximum(count, 1), 0),
+        complexity=jnp.where(present, num_vertices.astype(jnp.float32) / jnp.maximum(count, 1), 0),
     )
 
 

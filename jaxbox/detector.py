@@ -242,9 +242,18 @@ def _decide(cloud: PointCloud, segments: Segments, config: DetectorConfig) -> De
     )
 
 
+def _in_32_bits(cloud: PointCloud) -> PointCloud:
+    """The cloud in its documented types, which with ``jax_enable_x64`` a caller's arrays may not have."""
+    return PointCloud(
+        xyz1=jnp.asarray(cloud.xyz1, jnp.float32),
+        intensity=jnp.asarray(cloud.intensity, jnp.float32),
+        num_points=jnp.asarray(cloud.num_points, jnp.int32),
+    )
+
+
 def _find_vehicles(cloud: PointCloud, settings: PackedSettings, key: jax.Array) -> Detections:
     with building_for(accelerator=settings.accelerator):
-        config = settings.unpack()
+        cloud, config = _in_32_bits(cloud), settings.unpack()
         return _decide(cloud, _segment(cloud, config, key), config)
 
 
@@ -257,14 +266,14 @@ _detect_jit = jax.jit(_find)
 def segment_packed(cloud: PointCloud, settings: PackedSettings, key: jax.Array) -> Segments:
     """`segment`, of settings that were checked and packed."""
     with building_for(accelerator=settings.accelerator):
-        return _segment(cloud, settings.unpack(), key)
+        return _segment(_in_32_bits(cloud), settings.unpack(), key)
 
 
 @jax.jit
 def decide_packed(cloud: PointCloud, segments: Segments, settings: PackedSettings) -> Detections:
     """`decide`, of settings that were checked and packed."""
     with building_for(accelerator=settings.accelerator):
-        return _decide(cloud, segments, settings.unpack())
+        return _decide(_in_32_bits(cloud), segments, settings.unpack())
 
 
 @_find.def_vmap

@@ -201,7 +201,7 @@ def _count_changes(beams: jax.Array, ends: tuple[jax.Array, jax.Array]) -> jax.A
     """Beams that begin in each cell less those that end there."""
     if on_accelerator():
         # One scatter reads and writes the cells once, which counts in a batch.
-        return beams.at[jnp.stack(ends)].add(jnp.array([[1], [-1]]), mode="drop")
+        return beams.at[jnp.stack(ends)].add(jnp.array([[1], [-1]], jnp.int32), mode="drop")
     return beams.at[ends[0]].add(1, mode="drop").at[ends[1]].add(-1, mode="drop")
 
 
@@ -352,9 +352,9 @@ def _ray_fan(center: jax.Array, half_l: jax.Array, half_w: jax.Array, yaw: jax.A
     x, y = center[:, 0], center[:, 1]
     u, v = x * cos + y * sin, y * cos - x * sin
     # The azimuths of the corners, from that of the centre on.
-    corner_u = u + jnp.array([-1.0, -1.0, 1.0, 1.0])[:, None] * half_l
-    corner_v = v + jnp.array([-1.0, 1.0, -1.0, 1.0])[:, None] * half_w
-    spread = _arctan2(u * corner_v - v * corner_u, u * corner_u + v * corner_v)
+    to_front, to_left = jnp.array([[-1, -1, 1, 1], [-1, 1, -1, 1]], jnp.float32)[..., None]
+    corner_u, corner_v = u[None] + to_front * half_l[None], v[None] + to_left * half_w[None]
+    spread = _arctan2(u[None] * corner_v - v[None] * corner_u, u[None] * corner_u + v[None] * corner_v)
     low, high = jnp.min(spread, axis=0), jnp.max(spread, axis=0)
     azimuth = _arctan2(y, x) + (low + high) / 2
     along, across = jnp.cos(azimuth - yaw), jnp.sin(azimuth - yaw)
@@ -369,8 +369,8 @@ def _ray_stretches(fan: Fan, num_rays: int, axis: int) -> tuple[jax.Array, jax.A
     """
     middle, half, along, across, u0, v0, half_l, half_w = (jnp.expand_dims(a, axis) for a in fan)
     # A quarter turn at most, as seen from outside the box; from inside, any direction leads out.
-    share = (2 * jnp.arange(num_rays) + 1) / num_rays - 1
-    offset = jnp.expand_dims(share, 1 - axis) * half
+    place = 2 * jnp.arange(num_rays, dtype=jnp.float32) + 1
+    offset = jnp.expand_dims(place / num_rays - 1, 1 - axis) * half
     cos, sin = _cos_sin(offset)
     enter_u, leave_u = _slab(u0, along * cos - across * sin, half_l)
     enter_v, leave_v = _slab(v0, across * cos + along * sin, half_w)

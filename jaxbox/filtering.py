@@ -75,8 +75,8 @@ def filter_outliers(
     cells = store(cell_of(xyz1))
     # One scatter for the sums and the counts: a point is what is added.
     num_cells = (num_x * stride + 2 * margin) * width
-    sums = jnp.zeros((num_cells, 4)).at[cells].add(xyz1, mode="promise_in_bounds")
-    weight = jnp.exp(-0.5 * (cell_m / jnp.asarray(bandwidth_m)) ** 2)
+    sums = jnp.zeros((num_cells, 4), jnp.float32).at[cells].add(xyz1, mode="promise_in_bounds")
+    weight = jnp.exp(-0.5 * (cell_m / jnp.asarray(bandwidth_m, jnp.float32)) ** 2)
     windows = _window_sums(sums.reshape(-1, 4 * width), stride, weight)
 
     def window_of(cell: jax.Array) -> jax.Array:
@@ -113,13 +113,13 @@ def _of_occupied(function: Callable[[jax.Array], jax.Array], sums: jax.Array) ->
     size = BLOCK_CELLS * 4
     blocks = sums.reshape(-1, size)
     # A product, since it is computed once: the compiler would count again in each reader.
-    count = blocks @ jnp.tile(jnp.array([0.0, 0, 0, 1]), BLOCK_CELLS)
+    count = blocks @ jnp.tile(jnp.array([0, 0, 0, 1], jnp.float32), BLOCK_CELLS)
     occupied, num = compact(count > 0, blocks.shape[0])
 
     def step(start: jax.Array, ends: jax.Array) -> jax.Array:
         block = jax.lax.dynamic_slice_in_dim(occupied, start, min(CHUNK_BLOCKS, blocks.shape[0]))
-        cell = (block[:, None] * BLOCK_CELLS + jnp.arange(BLOCK_CELLS)).reshape(-1)
-        return ends.at[block].set(function(cell).reshape(-1, size), mode="drop")
+        cell = block[:, None] * BLOCK_CELLS + jnp.arange(BLOCK_CELLS, dtype=jnp.int32)[None]
+        return ends.at[block].set(function(cell.reshape(-1)).reshape(-1, size), mode="drop")
 
     return for_chunks(num, CHUNK_BLOCKS, step, blocks)
 

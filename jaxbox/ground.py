@@ -69,10 +69,10 @@ def cell_minima(
     i = jnp.floor((xyz[:, 0] + half_x_m) / GROUND_CANDIDATE_CELL_M).astype(jnp.int32)
     j = jnp.floor((xyz[:, 1] + half_y_m) / GROUND_CANDIDATE_CELL_M).astype(jnp.int32)
     cell, num_cells = i * columns + j, rows * columns
-    table = jnp.arange(xyz.shape[0]) % MINIMA_TABLES
+    table = jnp.arange(xyz.shape[0], dtype=jnp.int32) % MINIMA_TABLES
     # What rounding puts past the last cell would be another table's.
     place = jnp.where(inside & (cell < num_cells), table * num_cells + cell, MINIMA_TABLES * num_cells)
-    lowest = jnp.full(MINIMA_TABLES * num_cells, jnp.inf).at[place].min(xyz[:, 2], mode="drop")
+    lowest = jnp.full(MINIMA_TABLES * num_cells, jnp.inf, jnp.float32).at[place].min(xyz[:, 2], mode="drop")
     lowest = jnp.min(lowest.reshape(MINIMA_TABLES, -1), axis=0)
     occupied = jnp.isfinite(lowest)
     i, j = np.indices((rows, columns), np.float32).reshape(2, -1)
@@ -99,7 +99,7 @@ def spread_points(
     """
     # Quotient and remainder apart, so that the product stays within int32.
     rows = jnp.minimum(num_points, xyz.shape[0])
-    j = jnp.arange(num_candidates)
+    j = jnp.arange(num_candidates, dtype=jnp.int32)
     index = j * (rows // num_candidates) + j * (rows % num_candidates) // num_candidates
     return xyz[index], mask[index] & (rows > 0)
 
@@ -148,24 +148,26 @@ def fit_ground_plane(
         return jnp.sum(is_near(plane), dtype=jnp.float32)
 
     index, num = compact(mask, mask.shape[0])
-    draws = _draw(key, round_index, (num_hypotheses, 3))
-    picks = index[jnp.minimum((draws * num).astype(jnp.int32), jnp.maximum(num - 1, 0))]
+    draws = _draw(key, round_index, (num_hypotheses, 3)) * num.astype(jnp.float32)
+    picks = index[jnp.minimum(draws.astype(jnp.int32), jnp.maximum(num - 1, 0))]
     planes = jax.vmap(_plane_through)(candidates[jnp.minimum(picks, mask.shape[0] - 1)])
     support = (
         jax.vmap(support_of)(planes)
         if on_accelerator()
         else jax.lax.map(support_of, planes, batch_size=HYPOTHESES_AT_A_TIME)
     )
-    best = planes[jnp.argmax(jnp.where(_is_level(planes.T, max_grade), support, 0))]
+    support = jnp.where(_is_level(planes.T, max_grade), support, 0)
+    best = planes[jax.lax.argmax(support, 0, jnp.int32)]
     refit = functools.partial(_refit, candidates)
     if on_accelerator():
         plane = functools.reduce(lambda p, _: refit(is_near(p), p), range(num_refits), best)
     else:
-        plane = jax.lax.fori_loop(0, num_refits, lambda _, p: refit(is_near(p), p), best)
+        plane, _ = jax.lax.scan(lambda p, _: (refit(is_near(p), p), None), best, length=num_refits)
     num_inliers = jnp.where(_is_level(plane, max_grade), count(is_near(plane)), 0)
-    found = (num_inliers >= 3) & (num_inliers >= min_inlier_fraction * num)
+    needed = min_inlier_fraction * num.astype(jnp.float32)
+    found = (num_inliers >= 3) & (num_inliers.astype(jnp.float32) >= needed)
     lowest = -greatest(jnp.where(mask, -candidates[:, 2], -jnp.inf), -jnp.inf)
-    level = jnp.array([0.0, 0.0, 1.0]) * jnp.where(jnp.isfinite(lowest), lowest, 0)
+    level = jnp.array([0, 0, 1], jnp.float32) * jnp.where(jnp.isfinite(lowest), lowest, 0)
     return GroundPlane(jnp.where(found, plane, level), found, jnp.where(found, num_inliers, 0))
 
 
@@ -271,7 +273,7 @@ def _refit(candidates: jax.Array, inliers: jax.Array, plane: jax.Array) -> jax.A
     num = jnp.maximum(count(inliers), 1).astype(jnp.float32)
     mean = jnp.sum(jnp.where(inliers, rows, 0), axis=1) / num
     centred = jnp.where(inliers, rows - mean[:, None], 0)
-    cov = jnp.sum(centred[:, None] * centred, axis=-1) / num
+    cov = jnp.sum(centred[:, None] * centred[None], axis=-1) / num
     determinant = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
     a = (cov[0, 2] * cov[1, 1] - cov[1, 2] * cov[0, 1]) / determinant
     b = (cov[1, 2] * cov[0, 0] - cov[0, 2] * cov[0, 1]) / determinant
@@ -351,7 +353,7 @@ def fit_ground_surface(
     i, j = (jnp.floor((xyz[:, axis] + half_m) / cell_m).astype(jnp.int32) for axis in (0, 1))
     inside = (i >= 0) & (i < n) & (j >= 0) & (j < n)
     cell = jnp.where(mask & near_plane & inside & (rho > blind_radius_m), i * n + j, n * n)
-    lowest = jnp.full(n * n, jnp.inf).at[cell].min(residual, mode="drop").reshape(n, n)
+    lowest = jnp.full(n * n, jnp.inf, jnp.float32).at[cell].min(residual, mode="drop").reshape(n, n)
     envelope = _lower_envelope(lowest, max_grade * cell_m, num_envelope_rounds)
     ground = jnp.isfinite(lowest) & (lowest < envelope + envelope_margin_m)
     return _smooth(jnp.where(ground, lowest, 0), ground.astype(jnp.float32), smoothing_m / cell_m)
@@ -416,8 +418,8 @@ def _blur(grids: list[jax.Array], sigma_cells: jax.Array | float) -> tuple[jax.A
     """
     n = grids[0].shape[0]
     taps = _gaussian_taps(n, sigma_cells)
-    index = jnp.arange(n)
-    matrix = taps[index - index[:, None] + n - 1]
+    index = jnp.arange(n, dtype=jnp.int32)
+    matrix = taps[index[None] - index[:, None] + n - 1]
     product = functools.partial(jnp.matmul, precision="highest")
     rows = product(matrix, jnp.concatenate(grids, axis=1))
     blurred = product(rows.reshape(2 * n, n), matrix).reshape(n, 2, n)
@@ -426,7 +428,7 @@ def _blur(grids: list[jax.Array], sigma_cells: jax.Array | float) -> tuple[jax.A
 
 def _gaussian_taps(n: int, sigma: jax.Array | float) -> jax.Array:
     """(2 n - 1,) float32: the Gaussian from n - 1 cells before its middle to as many after."""
-    offset = jnp.arange(-(n - 1), n)
+    offset = jnp.arange(-(n - 1), n, dtype=jnp.float32)
     reach = jnp.floor(GAUSSIAN_TRUNCATION * sigma + 0.5)
     taps = jnp.where(jnp.abs(offset) <= reach, jnp.exp(-0.5 * (offset / sigma) ** 2), 0)
     return taps / jnp.sum(taps)
@@ -435,8 +437,9 @@ def _gaussian_taps(n: int, sigma: jax.Array | float) -> jax.Array:
 def _enlarge(grid: jax.Array, size: int, ratio: int) -> jax.Array:
     """The grid on cells smaller by the ratio, bilinear between its own; its border holds beyond it."""
     n = grid.shape[0]
-    at = jnp.clip((jnp.arange(size) + 0.5) / ratio - 0.5, 0, n - 1)
-    matrix = jnp.maximum(1 - jnp.abs(at[:, None] - jnp.arange(n)), 0)
+    row, own = jnp.arange(size, dtype=jnp.float32), jnp.arange(n, dtype=jnp.float32)
+    at = jnp.clip((row + 0.5) / ratio - 0.5, 0, n - 1)
+    matrix = jnp.maximum(1 - jnp.abs(at[:, None] - own[None]), 0)
     product = functools.partial(jnp.matmul, precision="highest")
     return product(product(matrix, grid), matrix.T)
 
@@ -457,7 +460,7 @@ def surface_height(surface: jax.Array, xy: jax.Array, *, cell_m: float, half_m: 
     # Axis by axis: the compiler vectorises along the points, not along so short a row.
     at = [jnp.clip((xy[..., a] + half_m) / (POOL_CELLS * cell_m) - 0.5, 0, n - 1.001) for a in (0, 1)]
     i, j = (value.astype(jnp.int32) for value in at)
-    u, v = at[0] - i, at[1] - j
+    u, v = at[0] - i.astype(jnp.float32), at[1] - j.astype(jnp.float32)
     near = lookup(surface, i, j) * (1 - v) + lookup(surface, i, j + 1) * v
     far = lookup(surface, i + 1, j) * (1 - v) + lookup(surface, i + 1, j + 1) * v
     return near * (1 - u) + far * u

@@ -55,7 +55,7 @@ def sort_by_group(
     """
     size = group.shape[0]
     num_rows = jnp.minimum(num_rows, size)
-    group = store(jnp.where(jnp.arange(size) < num_rows, group, num_groups))
+    group = store(jnp.where(jnp.arange(size, dtype=jnp.int32) < num_rows, group, num_groups))
     count = jnp.zeros(num_groups, jnp.int32).at[group].add(1, mode="drop")
     end = prefix_sum(count)
 

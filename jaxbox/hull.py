@@ -37,7 +37,7 @@ def find_bounds(
         point = take(xy, row)
         return bounds.at[slot].max(jnp.concatenate([point, -point], axis=1), mode="drop")
 
-    none = jnp.full((num_clusters, 4), -jnp.inf)
+    none = jnp.full((num_clusters, 4), -jnp.inf, jnp.float32)
     absent = num_clusters, xy.shape[0]
     bounds = fold_rows(widen, none, (slot, row), num_rows=num_rows, absent=absent)
     return -bounds[:, 2:], bounds[:, :2]
@@ -136,25 +136,26 @@ def convex_hulls(
     chain_x, chain_y, count = _lower_hulls(*store([_both_ways(x), _both_ways(y)]))
     present = count[:size] > 0
     # A chain that ends where the other begins leaves that point to it.
-    end = jnp.maximum(count - 1, 0), jnp.arange(2 * size)
+    end = jnp.maximum(count - 1, 0), jnp.arange(2 * size, dtype=jnp.int32)
     closes_x, closes_y = (chain[end] == -jnp.roll(chain[0], size) for chain in (chain_x, chain_y))
-    count = count - (closes_x & closes_y & (count > 0))
+    count = count - (closes_x & closes_y & (count > 0)).astype(jnp.int32)
     # Points all in one place close both chains.
-    num_lower = jnp.maximum(count[:size], present)
-    num = num_lower + count[size:]
-    j = jnp.arange(max_vertices)[:, None]
+    num_lower = jnp.maximum(count[:size], present.astype(jnp.int32))[None]
+    num = num_lower + count[None, size:]
+    j, column = jnp.arange(max_vertices, dtype=jnp.int32)[:, None], jnp.arange(size, dtype=jnp.int32)[None]
     pick = jnp.where(num > max_vertices, j * num // max_vertices, jnp.maximum(jnp.minimum(j, num - 1), 0))
     is_lower = pick < num_lower
-    place = jnp.where(is_lower, pick, pick - num_lower), jnp.arange(size) + jnp.where(is_lower, 0, size)
+    place = jnp.where(is_lower, pick, pick - num_lower), jnp.where(is_lower, column, column + size)
     # Stored: a look-up vectorises neither with what finds its place, nor within the write of a chunk (XLA).
     place = store(place)
     x, y = store([lookup(chain, *place) for chain in (chain_x, chain_y)])
-    return jnp.where(is_lower, x, -x), jnp.where(is_lower, y, -y), num
+    return jnp.where(is_lower, x, -x), jnp.where(is_lower, y, -y), num[0]
 
 
 def _both_ways(values: jax.Array) -> jax.Array:
     """(M, 2 C): values (M, C) and their negatives. A product, since a concatenation does not vectorise."""
-    return (values[:, None] * jnp.array([[1], [-1]], values.dtype)).reshape(values.shape[0], -1)
+    sign = jnp.array([1, -1], values.dtype)[None, :, None]
+    return (values[:, None] * sign).reshape(values.shape[0], -1)
 
 
 def _lower_hulls(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -170,26 +171,28 @@ def _lower_hulls(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.
     def step(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         i, _, chain_x, chain_y = state
         at_x, at_y = chain_x[i], chain_y[i]
-        slope = jnp.where(x > at_x, (y - at_y) / (x - at_x), far)
+        slope = jnp.where(x > at_x[None], (y - at_y[None]) / (x - at_x[None]), far)
         least = jnp.min(slope, axis=0)
         # Of points on a line the farthest.
-        next_x = jnp.max(jnp.where(slope == least, x, -far), axis=0)
-        next_y = jnp.min(jnp.where((slope == least) & (x == next_x), y, far), axis=0)
+        is_least = slope == least[None]
+        next_x = jnp.max(jnp.where(is_least, x, -far), axis=0)
+        next_y = jnp.min(jnp.where(is_least & (x == next_x[None]), y, far), axis=0)
         grows = least < far
         chain_x = chain_x.at[i + 1].set(jnp.where(grows, next_x, at_x))
         chain_y = chain_y.at[i + 1].set(jnp.where(grows, next_y, at_y))
         return i + 1, jnp.any(grows), chain_x, chain_y
 
     left = jnp.min(jnp.where(x > -far, x, far), axis=0)
-    lowest = jnp.min(jnp.where(x == left, y, far), axis=0)
+    lowest = jnp.min(jnp.where(x == left[None], y, far), axis=0)
     present = left < far
     # One row more, for the step that finds that no chain grows.
-    chain = jnp.full((x.shape[0] + 1, x.shape[1]), -far)
+    chain = jnp.full((x.shape[0] + 1, x.shape[1]), -far, jnp.float32)
     chains = (chain.at[0].set(jnp.where(present, of_left, 0)) for of_left in (left, lowest))
     *_, chain_x, chain_y = jax.lax.while_loop(
         lambda state: state[1], step, (jnp.int32(0), jnp.any(present), *chains)
     )
-    return chain_x, chain_y, present + jnp.sum(chain_x[1:] > chain_x[:-1], axis=0)
+    num_more = jnp.sum(chain_x[1:] > chain_x[:-1], axis=0, dtype=jnp.int32)
+    return chain_x, chain_y, present.astype(jnp.int32) + num_more
 
 
 def _lower_hulls_at_once(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -198,24 +201,25 @@ def _lower_hulls_at_once(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Arr
     A point is a vertex where the steepest way to it from the left is less steep than the flattest way on to
     the right. From a point below the way is infinitely steep; of points in one place the first counts.
     """
-    far, num_points = jnp.inf, x.shape[0]
-    index, row = jnp.arange(num_points)[:, None], jnp.arange(num_points + 1)[:, None]
-    # The points (M, 1, C), held against all others (M, C). Each reduction over those makes comparisons of its
-    # own, by the places or by the differences: what two of them share would be stored for all pairs.
-    at_x, at_y = x[:, None], y[:, None]
-    is_again = jnp.any((x == at_x) & (y == at_y) & (index < index[:, None]), axis=1)
-    ahead, up = x - at_x, y - at_y
+    far, num_points = jnp.float32(jnp.inf), x.shape[0]
+    index, row = (jnp.arange(size, dtype=jnp.int32)[:, None] for size in (num_points, num_points + 1))
+    # The points (M, 1, C), against all others (1, M, C). Each reduction over those compares on its own, by
+    # the places or by the differences: what two of them share would be stored for all pairs.
+    at_x, at_y, at_index = x[:, None], y[:, None], index[:, None]
+    to_x, to_y, to_index = x[None], y[None], index[None]
+    is_again = jnp.any((to_x == at_x) & (to_y == at_y) & (to_index < at_index), axis=1)
+    ahead, up = to_x - at_x, to_y - at_y
     slope = up / ahead  # Not a number only where it is not taken.
     steepest = jnp.where((ahead == 0) & (up < 0), far, -far)
     arriving = jnp.max(jnp.where(ahead < 0, slope, steepest), axis=1)
     leaving = jnp.min(jnp.where(ahead > 0, slope, far), axis=1)
     is_vertex = (x > -far) & ~is_again & (arriving < leaving)
-    place = jnp.sum(is_vertex & (x < at_x), axis=1, dtype=jnp.int32)
+    place = jnp.sum(is_vertex[None] & (to_x < at_x), axis=1, dtype=jnp.int32)
     # Vertex k of each chain, by its place among the vertices.
-    is_in_row = is_vertex & (place == row[:, None])
-    chain_x, chain_y = (jnp.max(jnp.where(is_in_row, values, -far), axis=1) for values in (x, y))
+    is_in_row = is_vertex[None] & (place[None] == row[:, None])
+    chain_x, chain_y = (jnp.max(jnp.where(is_in_row, values, -far), axis=1) for values in (to_x, to_y))
     count = jnp.sum(is_vertex, axis=0, dtype=jnp.int32)
-    is_empty = (row == 0) & (count == 0)
+    is_empty = (row == 0) & (count == 0)[None]
     return jnp.where(is_empty, 0, chain_x), jnp.where(is_empty, 0, chain_y), count
 
 

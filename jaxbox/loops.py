@@ -220,11 +220,11 @@ def fold_rows(
         return update(state, index, jax.tree.map(lambda a, none: jnp.where(there, a, none), rows, absent))
 
     if on_accelerator():
-        return fold(state, jnp.arange(size), rows)
+        return fold(state, jnp.arange(size, dtype=jnp.int32), rows)
     whole = _whole_chunks(rows, chunk)
 
     def step(start: jax.Array, state: Any) -> Any:
-        index = start.astype(jnp.int32) + jnp.arange(chunk)
+        index = start.astype(jnp.int32) + jnp.arange(chunk, dtype=jnp.int32)
         return fold(
             state, index, jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, start, chunk), whole)
         )
@@ -266,16 +266,16 @@ def fold_points(
     if on_accelerator():
         # Points along the last axis, which reductions read without transposing, see `PointLists.table`.
         of_point = jax.vmap(functools.partial(update, init), out_axes=-1)(x, y)
-        exists = jnp.arange(capacity) < count[:, None]
+        exists = jnp.arange(capacity, dtype=jnp.int32)[None] < count[:, None]
         return jax.tree.map(
             lambda values, none: reduce(jnp.where(exists, values, none[..., None]), axis=-1), of_point, init
         )
 
-    there, unroll = jnp.arange(capacity)[:, None] < count, FOLD_UNROLL
+    there, unroll = jnp.arange(capacity, dtype=jnp.int32)[:, None] < count[None], FOLD_UNROLL
 
     def fill(values: jax.Array, value: Any) -> jax.Array:
         filled = jnp.where(there, values, value)
-        more = jnp.broadcast_to(value, (-capacity % unroll, values.shape[1]))
+        more = jnp.broadcast_to(jnp.asarray(value, values.dtype), (-capacity % unroll, values.shape[1]))
         return jnp.concatenate([filled, more])
 
     filled = fill(x, absent[0]), fill(y, absent[1])

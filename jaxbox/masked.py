@@ -148,7 +148,7 @@ def _count_before(mask: jax.Array) -> jax.Array:
     population = jax.lax.population_count(words).astype(jnp.int32)
     before = _sum_in_blocks(population) - population
     up_to = (jnp.uint32(2) << bit) - 1
-    inside = jax.lax.population_count(words[:, None] & up_to).astype(jnp.int32)
+    inside = jax.lax.population_count(words[:, None] & up_to[None]).astype(jnp.int32)
     return (before[:, None] + inside).reshape(-1)[:size]
 
 
@@ -219,7 +219,8 @@ def rows_in_use(present: jax.Array) -> jax.Array:
     >>> int(rows_in_use(jnp.array([False, True, False])))
     2
     """
-    return greatest(jnp.where(present, jnp.arange(1, present.shape[0] + 1), 0), 0)
+    number = jnp.arange(1, present.shape[0] + 1, dtype=jnp.int32)
+    return greatest(jnp.where(present, number, 0), 0)
 
 
 def take(rows: jax.Array, index: jax.Array, fill: Any = 0) -> jax.Array:
@@ -293,12 +294,13 @@ def count_true(*masks: jax.Array) -> jax.Array:
     size = max(mask.shape[0] for mask in masks)
     size += -size % WORD_BITS
     of_mask = [
-        jnp.where(jnp.pad(mask, (0, size - mask.shape[0])), 1 << k % per_word * bits, 0)
+        jnp.where(jnp.pad(mask, (0, size - mask.shape[0])), jnp.int32(1 << k % per_word * bits), 0)
         for k, mask in enumerate(masks)
     ]
     words = [functools.reduce(jnp.add, of_mask[k : k + per_word]) for k in range(0, len(masks), per_word)]
-    sums = jnp.stack([jnp.sum(word.reshape(-1, WORD_BITS), axis=1) for word in words])
-    counts = (sums[:, None] >> jnp.arange(per_word)[:, None] * bits) & (2**bits - 1)
+    sums = jnp.stack([jnp.sum(word.reshape(-1, WORD_BITS), axis=1, dtype=jnp.int32) for word in words])
+    place = jnp.arange(per_word, dtype=jnp.int32)[None, :, None] * bits
+    counts = (sums[:, None] >> place) & (2**bits - 1)
     return jnp.sum(counts.astype(jnp.float32), axis=-1).astype(jnp.int32).reshape(-1)[: len(masks)]
 
 

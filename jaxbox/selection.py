@@ -75,7 +75,7 @@ def find_statistics(
       The statistics; no points, and bounds of minus infinity, where there are none.
     """
     num_points = jnp.minimum(num_points, height.shape[0])
-    none = jnp.broadcast_to(jnp.where(IS_BOUND, -jnp.inf, 0), (max_components, NUM_COLUMNS))
+    none = jnp.broadcast_to(jnp.where(IS_BOUND, jnp.float32(-jnp.inf), 0), (max_components, NUM_COLUMNS))
     points = xy, height, in_slab
     add = _add_at_once if on_accelerator() else _add_one_by_one
     return Statistics(add(none, component, num_points, points))
@@ -107,7 +107,8 @@ def _add_one_by_one(
 
 def _add_at_once(table: jax.Array, component: jax.Array, num_points: jax.Array, points: Points) -> jax.Array:
     xy, height, in_slab = points
-    row = jnp.where(jnp.arange(height.shape[0]) < num_points, component, table.shape[0])
+    there = jnp.arange(height.shape[0], dtype=jnp.int32) < num_points
+    row = jnp.where(there, component, table.shape[0])
     own = jnp.broadcast_to(_own_row(xy, height, in_slab), (*row.shape, NUM_COLUMNS))
     bounds = table[:, :NUM_BOUNDS].at[row].max(own[..., :NUM_BOUNDS], mode="drop")
     # Whole numbers: ordered scatters of floats cost accelerators more.
@@ -155,8 +156,9 @@ def select_clusters(
     """
     capacity = sum(max_clusters)
     upper, num_points = statistics.upper, statistics.num_points
-    component = jnp.arange(num_points.shape[0])
-    keep = (num_points >= jnp.maximum(min_points, 1)) & (component >= first[0]) & (component < first[-1])
+    component = jnp.arange(num_points.shape[0], dtype=jnp.int32)
+    enough = num_points.astype(jnp.float32) >= jnp.maximum(min_points, 1.0)
+    keep = enough & (component >= first[0]) & (component < first[-1])
     extent_x, extent_y = upper[:, 0] + upper[:, 3], upper[:, 1] + upper[:, 4]
     keep = keep & (jnp.maximum(extent_x, extent_y) <= max_extent_m)
     keep = keep & (extent_x**2 + extent_y**2 >= min_extent_m**2)
@@ -175,7 +177,7 @@ def select_clusters(
         place = order - end[i]
         listed = keep & (place > 0) & (place <= size)
         row = jnp.where(listed, place - 1 + kept_up_to[i] - kept[i], row)
-    member = jnp.full(capacity, num_points.shape[0]).at[row].set(component, mode="drop")
+    member = jnp.full(capacity, num_points.shape[0], jnp.int32).at[row].set(component, mode="drop")
 
     def describe(member: jax.Array) -> tuple[jax.Array, ...]:
         bounds = take(upper, member)

@@ -202,8 +202,9 @@ class Clusters:
     def sum_by_map(self, values: jax.Array) -> jax.Array:
         """(maps,) sums of values (P,) of the clusters over each map."""
         end = jnp.cumsum(self.kept)[:, None]
-        row = jnp.arange(values.shape[0])
-        return jnp.sum(jnp.where((row >= end - self.kept[:, None]) & (row < end), values, 0), axis=1)
+        row = jnp.arange(values.shape[0], dtype=jnp.int32)[None]
+        own = (row >= end - self.kept[:, None]) & (row < end)
+        return jnp.sum(jnp.where(own, values, 0), axis=1, dtype=values.dtype)
 
 
 @jax.tree_util.register_dataclass

@@ -154,7 +154,7 @@ def count_points_around(
 
     def look(rows: tuple[jax.Array, list[jax.Array], list[jax.Array]]) -> jax.Array:
         frames, low, high = rows
-        i = low[0][:, None] + jnp.arange(MAX_CELL_ROWS)
+        i = low[0][:, None] + jnp.arange(MAX_CELL_ROWS, dtype=jnp.int32)[None]
         row = jnp.minimum(i, shape[0] - 1) * shape[1]
         first, after = begin[row + low[1][:, None]], end[row + high[1][:, None]]
         length = jnp.where(i <= high[0][:, None], after - first, 0)
@@ -218,10 +218,10 @@ def _count_runs(
 
     def step(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         # The run of each block: that which begins last, before it or with it.
-        place = start.astype(jnp.int32) + jnp.arange(at_once)
+        place = start.astype(jnp.int32) + jnp.arange(at_once, dtype=jnp.int32)
         present = (num_blocks > 0) & (end > place[0]) & (begin <= place[-1])
         at = jnp.where(present, jnp.maximum(begin - place[0], 0), at_once)
-        run = jnp.zeros(at_once, jnp.int32).at[at].max(jnp.arange(end.shape[0]), mode="drop")
+        run = jnp.zeros(at_once, jnp.int32).at[at].max(jnp.arange(end.shape[0], dtype=jnp.int32), mode="drop")
         run = prefix_max(run)
         offset = (place - begin[run]) * BLOCK_POINTS
         left = jnp.where(place < end[-1], length[run] - offset, 0)
@@ -233,14 +233,15 @@ def _count_runs(
 
             return jax.vmap(piece)(first[run] + offset)
 
-        there = jnp.arange(BLOCK_POINTS) < left[:, None]
+        there = jnp.arange(BLOCK_POINTS, dtype=jnp.int32)[None] < left[:, None]
         words, highest = _judge(
             frames[box], there, [block(column) for column in points], margin_m, ring_m, upper_height_m
         )
-        counts = (words[:, :, None] >> jnp.arange(NUM_KINDS) * COUNT_BITS) & (2**COUNT_BITS - 1)
+        digit = jnp.arange(NUM_KINDS, dtype=jnp.int32)[None, None]
+        counts = (words[:, :, None] >> digit * COUNT_BITS) & (2**COUNT_BITS - 1)
         return state[0].at[box].add(counts.reshape(at_once, -1)), state[1].at[box].max(highest)
 
-    none = jnp.zeros((num_boxes, NUM_KINDS + NUM_LEVELS), jnp.int32), jnp.zeros(num_boxes)
+    none = jnp.zeros((num_boxes, NUM_KINDS + NUM_LEVELS), jnp.int32), jnp.zeros(num_boxes, jnp.float32)
     counts, highest = for_chunks(end[-1], at_once, step, none)
     return counts.astype(jnp.float32), highest
 
@@ -270,18 +271,18 @@ def _judge(
     # One sum counts all kinds, each in its own bits.
     kinds = (inside & low, inside & ~low, ~inside & (out < ring_m) & low, upper, recessed)
     first = functools.reduce(
-        jnp.add, [jnp.where(kind, 1 << k * COUNT_BITS, 0) for k, kind in enumerate(kinds)]
+        jnp.add, [jnp.where(kind, jnp.int32(1 << k * COUNT_BITS), 0) for k, kind in enumerate(kinds)]
     )
     share = height / max_height - LOWEST_LEVEL
     level = jnp.minimum(share * (NUM_LEVELS / (1 - LOWEST_LEVEL)), NUM_LEVELS - 1).astype(jnp.int32)
     level = jnp.where(inside & low & (share > 0), level, NUM_LEVELS)
     place, digit = split_index(level, NUM_KINDS)
-    others = jnp.where(
-        place == jnp.arange(NUM_LEVELS // NUM_KINDS)[:, None, None], 1 << digit * COUNT_BITS, 0
-    )
+    word = jnp.arange(NUM_LEVELS // NUM_KINDS, dtype=jnp.int32)[:, None, None]
+    others = jnp.where(place[None] == word, 1 << digit * COUNT_BITS, 0)
     # Heights are not negative, and the bits of such numbers are in their order: integers' maxima vectorise.
     highest = jax.lax.bitcast_convert_type(jnp.where(inside & low, height, 0), jnp.int32)
-    counts = jnp.concatenate([jnp.sum(first, axis=1)[:, None], jnp.sum(others, axis=2).T], axis=1)
+    sums = jnp.sum(first, axis=1, dtype=jnp.int32), jnp.sum(others, axis=2, dtype=jnp.int32)
+    counts = jnp.concatenate([sums[0][:, None], sums[1].T], axis=1)
     return counts, jax.lax.bitcast_convert_type(jnp.max(highest, axis=1), jnp.float32)
 
 
@@ -293,7 +294,8 @@ def _top(highest: jax.Array, num_stray: jax.Array, levels: jax.Array, max_height
     higher = jnp.dot(levels, beyond, precision=jax.lax.Precision.HIGHEST)
     num_stray = num_stray[:, None]
     is_top = (higher <= num_stray) & (num_stray < higher + levels)
-    above = jnp.arange(NUM_LEVELS, 0, -1) - 1 + (num_stray - higher) / jnp.maximum(levels, 1)
+    above = jnp.arange(NUM_LEVELS, 0, -1, dtype=jnp.float32)[None] - 1
+    above = above + (num_stray - higher) / jnp.maximum(levels, 1)
     share = jnp.sum(jnp.where(is_top, 1 - above * ((1 - LOWEST_LEVEL) / NUM_LEVELS), 0), axis=1)
     return jnp.where(jnp.any(is_top, axis=1), jnp.minimum(share * max_height, highest), highest)
 
@@ -347,7 +349,7 @@ def evidence_score(
     Returns:
       (P,) float32 in [0, 1].
     """
-    dense = jnp.minimum(num_points / saturation_points, 1) ** sparseness_power
+    dense = jnp.minimum(num_points.astype(jnp.float32) / saturation_points, 1) ** sparseness_power
     grounded = jnp.minimum((support + 0.5) / support_points, 1)
     gate = jax.nn.sigmoid((objective - objective_gate) / objective_softness)
     return dense * jnp.exp(-((free_length / free_scale) ** 2)) * hit * grounded * gate
@@ -444,7 +446,7 @@ def suppress(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | flo
     rivals = _overlaps(boxes, count(valid), max_overlap)[: valid.shape[0]]
 
     def without_rivals(keep: jax.Array) -> jax.Array:
-        return valid & ~jnp.any((rivals & keep) != 0, axis=1)
+        return valid & ~jnp.any((rivals & keep[None]) != 0, axis=1)
 
     def step(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         _, keep = state
@@ -459,12 +461,12 @@ def suppress(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | flo
 
 def _suppress_at_once(boxes: jax.Array, valid: jax.Array, max_overlap: jax.Array | float) -> jax.Array:
     """As `suppress`, all pairs at once, and some rounds before the host looks whether they were enough."""
-    row = jnp.arange(valid.shape[0])
+    row = jnp.arange(valid.shape[0], dtype=jnp.int32)
     iou = jax.vmap(jax.vmap(rectangle_iou, (None, 0)), (0, None))(boxes, boxes)
-    rivals = (iou > max_overlap) & (row < row[:, None])
+    rivals = (iou > max_overlap) & (row[None] < row[:, None])
 
     def step(keep: jax.Array) -> jax.Array:
-        return valid & ~jnp.any(rivals & keep, axis=1)
+        return valid & ~jnp.any(rivals & keep[None], axis=1)
 
     def rounds(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         before_last = functools.reduce(lambda keep, _: step(keep), range(ROUNDS - 1), state[1])
@@ -481,7 +483,7 @@ def _overlaps(boxes: jax.Array, num_boxes: jax.Array, max_overlap: jax.Array | f
     def tile(i: jax.Array, j: jax.Array, bits: jax.Array) -> jax.Array:
         first, second = (jax.lax.dynamic_slice_in_dim(boxes, k, OVERLAP_TILE) for k in (i, j))
         iou = jax.vmap(jax.vmap(rectangle_iou, (None, 0)), (0, None))(first, second)
-        better = j + row < i + row[:, None]
+        better = j + row[None] < i + row[:, None]
         return jax.lax.dynamic_update_slice(bits, _pack((iou > max_overlap) & better), (i, j // OVERLAP_TILE))
 
     def tiles(i: jax.Array, bits: jax.Array) -> jax.Array:

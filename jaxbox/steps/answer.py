@@ -154,13 +154,13 @@ def _owners(
       num: () int32; only the first so many rows count.
     """
     num_detections, num_clusters = valid.shape[0], proposals.num_points.shape[0]
-    rank = jnp.where(valid, jnp.arange(num_detections), num_detections)
-    of_cluster = jnp.full(num_clusters + 1, num_detections).at[kept.cluster].min(rank, mode="drop")
+    rank = jnp.where(valid, jnp.arange(num_detections, dtype=jnp.int32), num_detections)
+    of_cluster = jnp.full(num_clusters + 1, num_detections, jnp.int32).at[kept.cluster].min(rank, mode="drop")
     # No point is inside the box of no detection.
     frame = jnp.pad(kept.frame, ((0, 1), (0, 0)), constant_values=-1)
 
     def own(xy: jax.Array, clusters: Sequence[jax.Array]) -> jax.Array:
-        owner = jnp.full(xy.shape[0], num_detections)
+        owner = jnp.full(xy.shape[0], num_detections, jnp.int32)
         for cluster in clusters:
             detection = lookup(of_cluster, cluster)
             x, y, cos, sin, half_length, half_width = jnp.take(frame, detection, axis=0, mode="clip").T
@@ -172,7 +172,8 @@ def _owners(
 
     if on_accelerator():
         # To list those that are asked takes longer there than to ask all.
-        return jnp.arange(obstacles.row.shape[0]), own(obstacles.xy, list(proposals.cluster)), obstacles.count
+        every = jnp.arange(obstacles.row.shape[0], dtype=jnp.int32)
+        return every, own(obstacles.xy, list(proposals.cluster)), obstacles.count
     best = functools.reduce(jnp.minimum, [lookup(of_cluster, cluster) for cluster in proposals.cluster])
     asked, num_asked = compact(store(best < num_detections), best.shape[0], num=obstacles.count)
 
@@ -230,8 +231,8 @@ def _counts(
 def _status(cloud: PointCloud, counts: Counts, heights: Heights, config: DetectorConfig) -> jax.Array:
     settings = config.vehicles
     not_valid = counts.dropped_points + counts.nonfinite_points + counts.out_of_range_points
-    max_clusters = jnp.array([m.max_clusters for m in config.clustering.maps])
-    max_cells = jnp.array([m.max_cells for m in config.clustering.maps])
+    max_clusters = jnp.array([m.max_clusters for m in config.clustering.maps], jnp.int32)
+    max_cells = jnp.array([m.max_cells for m in config.clustering.maps], jnp.int32)
     bits = {
         Status.EMPTY: cloud.num_points == not_valid,
         Status.NONFINITE_POINTS: counts.nonfinite_points > 0,

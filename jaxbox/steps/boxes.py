@@ -84,7 +84,7 @@ def _hull_points(
     index = hull.extreme_points(cluster, row, num, obstacles.xy, *bounds, num_slices=config.hull.num_slices)
     x, y, count = trace_hulls(obstacles.xy, index, proposals.num_clusters, config)
     capacity = x.shape[0]
-    start, listed = jnp.arange(num_clusters) * capacity, jnp.minimum(count, capacity)
+    start, listed = jnp.arange(num_clusters, dtype=jnp.int32) * capacity, jnp.minimum(count, capacity)
     points = box.PointLists(x.T.reshape(-1), y.T.reshape(-1), start, listed, capacity)
     return points, jnp.max(count)
 
@@ -133,7 +133,8 @@ def _list_points(
     num_maps, num_obstacles = proposals.cluster.shape
     entry, num = compact(listed, capacity, num=obstacles.count)
     # The remainder by the number of obstacles, without the division.
-    row = entry - num_obstacles * sum(entry >= num_obstacles * i for i in range(1, num_maps))
+    maps_before = [(entry >= num_obstacles * i).astype(jnp.int32) for i in range(1, num_maps)]
+    row = entry - num_obstacles * sum(maps_before)
     return jnp.take(proposals.cluster.reshape(-1), entry, mode="clip"), row, num
 
 
@@ -159,7 +160,7 @@ def complete_boxes(
 
     Last, how many assignments the evidence had to weigh, which completion.max_assignments must hold.
     """
-    preference = jnp.zeros(config.box.num_angles)
+    preference = jnp.zeros(config.box.num_angles, jnp.float32)
     if config.box.scene_direction and seen is not None:
         preference = _scene_preference(fits, proposals, seen, config)
     readings = [best_rectangles(fits, proposals.num_clusters, preference)]
@@ -176,16 +177,16 @@ def _scene_preference(
     settings = config.box
     size = config.clustering.maps[0].max_clusters
     # Stored: what the compiler knows to be zeros would have kernels of its own.
-    no_preference = store(jnp.zeros(settings.num_angles))
+    no_preference = store(jnp.zeros(settings.num_angles, jnp.float32))
     rectangles = best_rectangles(fits, proposals.num_clusters, no_preference)
     rectangles = Rectangles(rectangles.rows[:size])
     long = longest_side(rectangles) >= settings.direction_min_extent_m
-    cluster, num = compact(long & (jnp.arange(size) < proposals.num_first), size)
+    cluster, num = compact(long & (jnp.arange(size, dtype=jnp.int32) < proposals.num_first), size)
     voters = Rectangles(take(rectangles.rows, cluster))
 
     def complete(voter: Rectangles) -> Boxes:
         """Both ways that it may lie, completed away from the sensor."""
-        ways = completion.way_to_lie(voter, jnp.arange(completion.NUM_WAYS)[:, None])
+        ways = completion.way_to_lie(voter, jnp.arange(completion.NUM_WAYS, dtype=jnp.int32)[:, None])
         car = jnp.full_like(ways.yaw, Label.CAR, jnp.int32)
         boxes = completion.extend_away(ways, **_class_options(car, config), **_limits(car, config))
         return jax.tree.map(lambda a: jnp.moveaxis(a, 0, 1), boxes)
@@ -199,7 +200,7 @@ def _scene_preference(
         voters.angle,
         longest_side(voters),
         take(proposals.num_points, cluster),
-        (jnp.arange(size) < num) & (free <= settings.direction_max_free),
+        (jnp.arange(size, dtype=jnp.int32) < num) & (free <= settings.direction_max_free),
         num_angles=settings.num_angles,
         weight=settings.direction_weight,
         sigma_deg=settings.direction_sigma_deg,
@@ -256,7 +257,7 @@ def _complete_by_evidence(
 
     def complete(of_trial: tuple[jax.Array, ...]) -> Boxes:
         cluster, label, placement, objective = of_trial
-        best = jnp.argmax(objective, axis=1)
+        best = jax.lax.argmax(objective, 1, jnp.int32)
         placement, objective = (
             jnp.take_along_axis(a, best[:, None], axis=1)[:, 0] for a in (placement, objective)
         )
@@ -317,7 +318,7 @@ def _judge_ways(
 
     prepared = map_rows(prepare, entry, num_rows=num)
     judged = map_rows(judge, prepared, num_rows=num, chunk=PROPOSAL_CHUNK)
-    nothing = jnp.zeros(num_entries, jnp.int32), jnp.full(num_entries, NOT_A_BOX)
+    nothing = jnp.zeros(num_entries, jnp.int32), jnp.full(num_entries, NOT_A_BOX, jnp.float32)
     of_entry = fold_rows(note, nothing, (entry, *judged), num_rows=num, absent=(num_entries, 0, 0.0))
     placement, objective = (a.reshape(-1, num_ways) for a in of_entry)
     return placement, objective, num

@@ -152,7 +152,7 @@ def _early_scores(
         )
 
     scores = map_rows(score, (boxes, trials.label, trials.cluster, rays), num_rows=trials.num)
-    return jnp.where(jnp.arange(scores.shape[0]) < trials.num, scores, 0)
+    return jnp.where(jnp.arange(scores.shape[0], dtype=jnp.int32) < trials.num, scores, 0)
 
 
 def _early_score(
@@ -203,7 +203,8 @@ def _choose(score: jax.Array, capacity: int, min_score: jax.Array | float) -> tu
     row, num = compact(above, capacity)
 
     def highest() -> jax.Array:
-        _, order = jax.lax.sort((-score, jnp.arange(score.shape[0])), num_keys=1, is_stable=True)
+        row = jnp.arange(score.shape[0], dtype=jnp.int32)
+        _, order = jax.lax.sort((-score, row), num_keys=1, is_stable=True)
         return jnp.sort(order[:capacity])
 
     if capacity >= score.shape[0]:
@@ -213,8 +214,9 @@ def _choose(score: jax.Array, capacity: int, min_score: jax.Array | float) -> tu
 
 def _num_better(score: jax.Array) -> jax.Array:
     """(P,) int32: how many rows have a higher score, or the same and come before."""
-    row = jnp.arange(score.shape[0])
-    better = (score > score[:, None]) | ((score == score[:, None]) & (row < row[:, None]))
+    row = jnp.arange(score.shape[0], dtype=jnp.int32)
+    comes_first = (score[None] == score[:, None]) & (row[None] < row[:, None])
+    better = (score[None] > score[:, None]) | comes_first
     return jnp.sum(better, axis=1, dtype=jnp.int32)
 
 
@@ -224,18 +226,19 @@ def _best_first(score: jax.Array, num: jax.Array) -> jax.Array:
     The place of a row is the number of rows before it: for the few that are there, counting beats a sort.
     """
     size = score.shape[0]
-    row = jnp.arange(size)
+    row = jnp.arange(size, dtype=jnp.int32)
     padded = jnp.pad(score, (0, -size % RANK_STEP))
 
     def step(start: jax.Array, place: jax.Array) -> jax.Array:
         for k in range(RANK_STEP):
             other = start + k
             rival = padded[other]
-            place = place + ((rival > score) | ((rival == score) & (other.astype(jnp.int32) < row)))
+            better = (rival > score) | ((rival == score) & (other.astype(jnp.int32) < row))
+            place = place + better.astype(jnp.int32)
         return place
 
     if on_accelerator():
         place = _num_better(score)
-        return jnp.full(size, size).at[jnp.where(score > 0, place, size)].set(row, mode="drop")
+        return jnp.full(size, size, jnp.int32).at[jnp.where(score > 0, place, size)].set(row, mode="drop")
     place = for_chunks(num, RANK_STEP, step, jnp.zeros_like(row), capacity=size)
-    return jnp.full(size, size).at[jnp.where(score > 0, place, size)].set(row, mode="drop")
+    return jnp.full(size, size, jnp.int32).at[jnp.where(score > 0, place, size)].set(row, mode="drop")

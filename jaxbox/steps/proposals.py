@@ -71,7 +71,7 @@ def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Proposals:
         min_extent_m=config.vehicles.min_extent_m,
         max_extent_m=settings.max_extent_m,
     )
-    all_fitted = clusters.num_slab < config.box.min_slab_points
+    all_fitted = clusters.num_slab.astype(jnp.float32) < config.box.min_slab_points
     cluster, fitted = _find_clusters(obstacles, component, clusters.row, all_fitted, config)
     num_fitted = jnp.where(all_fitted, clusters.num_points, clusters.num_slab)
     large, num_large = _large_clusters(clusters, config)
@@ -80,7 +80,7 @@ def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Proposals:
         cluster=cluster[:, :num],
         num_runs=components.num_runs,
         num_found=clusters.found,
-        num_clusters=jnp.sum(clusters.kept),
+        num_clusters=jnp.sum(clusters.kept, dtype=jnp.int32),
         num_first=clusters.kept[0],
         num_points=clusters.num_points,
         low=clusters.low,
@@ -145,10 +145,11 @@ def _find_cells(
     )
 
     size = obstacles.height.shape[0]
+    row = jnp.arange(size if on_accelerator() else CHUNK, dtype=jnp.int32)
 
     def step(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         table, flags = state
-        present = start + jnp.arange(size if on_accelerator() else CHUNK) < obstacles.count
+        present = start.astype(jnp.int32) + row < obstacles.count
         # Stored, or each map would draw the points together anew.
         xy = store(warp(_chunk(obstacles.xy, start)))
         found = find(xy, _chunk(obstacles.height, start), present)
@@ -188,7 +189,7 @@ def _find_clusters(
     """
     num_clusters = all_fitted.shape[0]
     # One look-up answers both.
-    code = 2 * row + take(all_fitted, row)
+    code = 2 * row + take(all_fitted, row).astype(jnp.int32)
 
     def step(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         in_slab = store(_in_slab(_chunk(obstacles.height, start), config))
@@ -202,14 +203,14 @@ def _find_clusters(
 
         return _for_maps(len(component), on_map, state)
 
-    init = jnp.full(component.shape, num_clusters), jnp.zeros(component.shape, bool)
+    init = jnp.full(component.shape, num_clusters, jnp.int32), jnp.zeros(component.shape, bool)
     return _fold_chunks(step, init, obstacles)
 
 
 def _large_clusters(clusters: Clusters, config: DetectorConfig) -> tuple[jax.Array, jax.Array]:
     settings = config.vehicles
     stands = clusters.low[:, 2] < settings.large_clearance_m
-    enough = clusters.num_points >= settings.large_min_points
+    enough = clusters.num_points.astype(jnp.float32) >= settings.large_min_points
     return compact((clusters.high[:, 2] > settings.large_height_m) & stands & enough, settings.max_large)
 
 
@@ -243,7 +244,7 @@ def list_trials(proposals: Proposals, readings: Sequence[Rectangles], config: De
 
     rows = is_large, proposals.high, *(rectangles.rows for rectangles in readings)
     worth_trying = map_rows(is_worth_trying, rows, num_rows=proposals.num_clusters).T
-    worth_trying = worth_trying & (jnp.arange(capacity) < proposals.num_clusters)
+    worth_trying = worth_trying & (jnp.arange(capacity, dtype=jnp.int32) < proposals.num_clusters)[None]
     index, num = compact(worth_trying.reshape(-1), capacity + 2 * max_large)
     present = index < worth_trying.size
     label, cluster = split_index(index, capacity)
