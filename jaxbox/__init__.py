@@ -1,5 +1,6 @@
 """jaxbox: training-free LiDAR vehicle detection as one compiled JAX function."""
 
+from jaxbox import serialization as _serialization  # noqa: F401 - jax.export learns the types below
 from jaxbox.batching import detect_batch
 from jaxbox.cache import enable_cache
 from jaxbox.config import DEFAULT_CUT, DetectorConfig

@@ -46,8 +46,8 @@ def rectangle_corners(center: jax.Array, size: jax.Array, yaw: jax.Array) -> jax
     Returns:
       (..., 4, 2), m: front left, rear left, rear right, front right.
     """
-    signs = jnp.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]])
-    local = signs * size[..., None, :2] / 2
+    signs = jnp.array([[1, 1], [-1, 1], [-1, -1], [1, -1]], size.dtype)
+    local = jnp.broadcast_to(signs, (*size.shape[:-1], 4, 2)) * size[..., None, :2] / 2
     return center[..., None, :2] + rotate(local, yaw[..., None])
 
 

@@ -152,7 +152,8 @@ def project_points(
 def _to_homogeneous_pixels(xyz_velo: jax.Array, calibration: Calibration) -> jax.Array:
     """(..., 3): (w u, w v, w), linear in the point, so that edges may be cut before the division."""
     matrix = jnp.matmul(calibration.P_rect, calibration.T_rect_velo, precision=_EXACT)
-    return jnp.matmul(xyz_velo, matrix[:, :3].T, precision=_EXACT) + matrix[:, 3]
+    turned = jnp.matmul(xyz_velo, matrix[:, :3].T, precision=_EXACT)
+    return turned + jnp.broadcast_to(matrix[:, 3], turned.shape)
 
 
 def _divide(uvw: jax.Array, near_m: jax.Array | float) -> jax.Array:
@@ -212,7 +213,7 @@ def project_boxes(
     edges_uv, edge_valid = _clip_edges(uvw, near_m)
     # Every corner ends an edge, so the clipped edges' ends hold all extremes.
     bounds = _bounding_box(edges_uv, edge_valid)
-    limit = jnp.tile(calibration.image_size_px.astype(jnp.float32) - 1, 2)
+    limit = jnp.tile(calibration.image_size_px.astype(jnp.float32) - 1, 2)[None]
     clipped = jnp.clip(bounds, 0, limit)
     visible = edge_valid.any(-1) & _meets(bounds, limit)
     area = _area(bounds)
@@ -251,7 +252,7 @@ def _bounding_box(edges_uv: jax.Array, edge_valid: jax.Array) -> jax.Array:
 
 
 def _meets(bounds: jax.Array, limit: jax.Array) -> jax.Array:
-    return jnp.all((bounds[:, 2:] > 0) & (bounds[:, :2] < limit[:2]), axis=-1)
+    return jnp.all((bounds[:, 2:] > 0) & (bounds[:, :2] < limit[:, :2]), axis=-1)
 
 
 def _area(boxes: jax.Array) -> jax.Array:

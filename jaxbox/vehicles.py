@@ -138,7 +138,6 @@ def count_points_around(
         return jnp.clip(index, 0, shape[axis] - 1).astype(jnp.int32)
 
     cell_of_point = cell(xy[:, 0], 0) * shape[1] + cell(xy[:, 1], 1)
-
     order, begin, end = sort_by_group(
         lambda i: i, cell_of_point, num_points, shape[0] * shape[1], room=BLOCK_POINTS
     )
@@ -270,9 +269,8 @@ def _judge(
     recessed = upper & (jnp.minimum(face_u - facing_u * u, face_v - facing_v * v) > 0)
     # One sum counts all kinds, each in its own bits.
     kinds = (inside & low, inside & ~low, ~inside & (out < ring_m) & low, upper, recessed)
-    first = functools.reduce(
-        jnp.add, [jnp.where(kind, jnp.int32(1 << k * COUNT_BITS), 0) for k, kind in enumerate(kinds)]
-    )
+    digits = [jnp.where(kind, jnp.int32(1 << k * COUNT_BITS), 0) for k, kind in enumerate(kinds)]
+    first = functools.reduce(jnp.add, digits)
     share = height / max_height - LOWEST_LEVEL
     level = jnp.minimum(share * (NUM_LEVELS / (1 - LOWEST_LEVEL)), NUM_LEVELS - 1).astype(jnp.int32)
     level = jnp.where(inside & low & (share > 0), level, NUM_LEVELS)

@@ -52,6 +52,9 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ["JAXBOX_CACHE_DIR"] = ""
     # Two, so that work over several devices can be tested; the first is the default as ever.
     jax.config.update("jax_num_cpu_devices", 2)
+    # What a user may ask for, the library must do, and the tests with it.
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+    jax.config.update("jax_numpy_rank_promotion", "raise")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -33,6 +33,7 @@ FOUNDATION = {
     "geometry",
     "mounting",
     "sensors",
+    "serialization",
 }
 STAGES = {
     "filtering", "ground", "clustering", "selection", "hull", "box", "descriptors", "evidence", "completion",

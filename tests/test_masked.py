@@ -186,7 +186,7 @@ def test_map_rows_equals_the_function_on_all_rows_and_zero_beyond_the_last_chunk
 
     def function(row):
         assert row["a"].shape == (at_a_time,)
-        return row["a"][:, None] * row["b"], row["a"] > 3
+        return row["a"][:, None] * row["b"].astype(jnp.float32), row["a"] > 3
 
     mapped = jax.jit(lambda num_rows: loops.map_rows(function, rows, num_rows=num_rows, chunk=chunk))
     values = np.arange(1.0, 11)

@@ -371,7 +371,7 @@ def test_scene_direction_of_sweeps_is_that_of_the_reference(cases):
             parity.pad(value, parity.MAX_CLUSTERS) for value in (yaw, extent, num_points, extent >= least)
         )
         preference = scene_preference(*rows, weight=0.2, **options)
-        assert direction == np.argmax(preference)
+        assert direction == np.argmax(np.asarray(preference))
 
 
 @pytest.mark.usefixtures("platform")

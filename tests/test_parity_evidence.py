@@ -89,7 +89,8 @@ def test_evidence_differs_in_few_cells_only(cases):
         )
         hit, free = (evidence.flagged_cells(np.asarray(words)) for words in (ours.hit, ours.free))
         hits, frees = (parity.flagged(sums).T for sums in (case.evidence.hit_sums, case.evidence.free_sums))
-        parity.assert_share(np.sum(ours.support != case.evidence.support), 200**2, 2e-3, "support")
+        other_support = np.asarray(ours.support) != case.evidence.support
+        parity.assert_share(np.sum(other_support), 200**2, 2e-3, "support")
         wrong += np.sum(hit != hits), hits.sum(), np.sum(free != frees), frees.sum()
     # A return whose azimuth or range lies on the edge of a cell may round into the next.
     parity.assert_share(*wrong[:2], 1e-4, "hits")

@@ -9,6 +9,7 @@ import threading
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import viser
@@ -246,7 +247,7 @@ def same_boxes(one, other):
 
 def test_a_session_counts_what_it_compiles_and_asks_nothing_twice(folder, frame, monkeypatch):
     # A detector that compiles in no time, by the same rules: shapes and static settings.
-    quick = jax.jit(lambda cloud, config: cloud.num_points + config.clustering.min_points)
+    quick = jax.jit(lambda cloud, config: cloud.num_points + jnp.int32(config.clustering.min_points))
     monkeypatch.setattr("jaxbox.viewer.session.detect", quick)
     monkeypatch.setattr("jaxbox.viewer.session.count_compilations", quick._cache_size)
     session = Session(Frames(io.open_sweeps(folder)))
