@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 
 from jaxbox import steps
 from jaxbox.config import DetectorConfig
-from jaxbox.devices import batch_together, building_for, on_accelerator
+from jaxbox.devices import batch_together, building_for, default_device, is_on_device, on_accelerator
 from jaxbox.evidence import Evidence
 from jaxbox.loops import AT_ONCE, apart, at_once
 from jaxbox.steps.boxes import Fits
@@ -164,12 +165,23 @@ def _operands(
     config = DetectorConfig() if config is None else config
     steps.check_settings(config)
     settings = PackedSettings.pack(config, accelerator=on_accelerator(cloud.xyz1))
+    known, device = settings.thresholds, default_device()
+    if isinstance(known, np.ndarray) and is_on_device(cloud.xyz1) and device in cloud.xyz1.devices():
+        # Nothing is sent in a call whose arrays are all there, see `jax.transfer_guard`.
+        settings = dataclasses.replace(settings, thresholds=_on_device(known.tobytes(), device))
     return cloud, settings, _default_key() if key is None else key
+
+
+@functools.lru_cache(maxsize=64)
+def _on_device(thresholds: bytes, _device: Any) -> jax.Array:
+    """Thresholds (T,) float32 on the default device, sent once."""
+    with jax.ensure_compile_time_eval():
+        return jax.device_put(np.frombuffer(thresholds, np.float32))
 
 
 @functools.cache
 def _default_key() -> jax.Array:
-    with jax.ensure_compile_time_eval():
+    with jax.ensure_compile_time_eval(), jax.transfer_guard("allow"):
         return jax.random.key(0)
 
 
@@ -259,7 +271,22 @@ def _find_vehicles(cloud: PointCloud, settings: PackedSettings, key: jax.Array) 
 
 _one_after_the_other = jax.custom_batching.sequential_vmap(_find_vehicles)
 _find = jax.custom_batching.custom_vmap(_find_vehicles)
-_detect_jit = jax.jit(_find)
+
+
+@jax.custom_jvp
+def _find_only(cloud: PointCloud, settings: PackedSettings, key: jax.Array) -> Detections:
+    return _find(cloud, settings, key)
+
+
+@_find_only.defjvp
+def _refuse_to_differentiate(_primals: Any, _tangents: Any) -> Any:
+    raise TypeError(
+        "jaxbox.detect is not differentiable, since it counts, compares and sorts points: differentiate "
+        "what follows it, with jax.lax.stop_gradient round what goes in."
+    )
+
+
+_detect_jit = jax.jit(_find_only)
 
 
 @jax.jit
@@ -290,5 +317,22 @@ def _find_many(
     axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, batched)
     with building_for(accelerator=settings.accelerator):
         find = _find_vehicles if batch_together() else _one_after_the_other
-        found = jax.vmap(find, axes)(cloud, settings, key)
+        find_all = _on_each_device(jax.vmap(find, axes), batched, cloud, settings, key)
+        found = find_all(cloud, settings, key)
     return found, jax.tree.map(lambda _: True, found)
+
+
+def _on_each_device(find_all: Callable[..., Detections], batched: Any, *operands: Any) -> Any:
+    """Lets each device find the vehicles of its own sweeps, where a batch is spread over a mesh.
+
+    Only the axes of a mesh whose type is `Explicit` are known while a program is traced.
+    """
+    leaves = zip(jax.tree.leaves(operands), jax.tree.leaves(batched), strict=True)
+    # `jax.vmap` has seen to it that all which is batched is spread alike.
+    sharding = next(jax.typeof(leaf).sharding for leaf, is_batched in leaves if is_batched)
+    if not sharding.spec or sharding.spec[0] is None:
+        return find_all
+    whole, rows = jax.sharding.PartitionSpec(), jax.sharding.PartitionSpec(sharding.spec[0])
+    specs = jax.tree.map(lambda is_batched: rows if is_batched else whole, batched)
+    # What varies over the mesh is not checked: the loops start from constants, which do not.
+    return jax.shard_map(find_all, mesh=sharding.mesh, in_specs=tuple(specs), out_specs=rows, check_vma=False)

@@ -4,7 +4,7 @@ import contextlib
 import contextvars
 import os
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, TypeGuard
 
 import jax
 import jax.core
@@ -51,9 +51,14 @@ def on_accelerator(array: Any = None) -> bool:
 
 def platform_of(array: Any) -> str:
     """The platform that JAX computes on with an array: for NumPy's, tracers or None its default."""
-    if isinstance(array, jax.Array) and not isinstance(array, jax.core.Tracer):
+    if is_on_device(array):
         return next(iter(array.devices())).platform
     return default_device().platform
+
+
+def is_on_device(array: Any) -> TypeGuard[jax.Array]:
+    """Whether an array is on a device: NumPy's are on the host, and tracers nowhere yet."""
+    return isinstance(array, jax.Array) and not isinstance(array, jax.core.Tracer)
 
 
 def default_device() -> Any:

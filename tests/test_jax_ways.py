@@ -1,0 +1,181 @@
+"""JAX's own ways, one test each: 64 bits, strict promotion, meshes, gradients, export, transfer guards."""
+
+import dataclasses
+
+import jax
+import jax.experimental
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbox import DetectorConfig, PointCloud, detect, devices, stack_clouds, synthetic
+
+CAPACITY = 4096
+PRESETS = sorted(DetectorConfig.presets())
+WIDE = {"int64", "uint64", "float64", "complex128"}
+SWEEPS = jax.sharding.PartitionSpec("sweeps")
+
+enable_x64 = jax.enable_x64 if hasattr(jax, "enable_x64") else jax.experimental.enable_x64
+
+
+def street(seed=0):
+    sweep = synthetic.make_sweep(seed, num_beams=16, num_azimuths=200)
+    return PointCloud.from_numpy(sweep.xyz, capacity=CAPACITY)
+
+
+def paper(cloud):
+    return detect(cloud, DetectorConfig.paper())
+
+
+def assert_same_bits(one, other):
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_array_equal(a, b)
+
+
+def row_of(batch, row):
+    return jax.tree.map(lambda leaf: leaf[row], jax.device_get(batch))
+
+
+def avals_in(jaxpr):
+    """Types of all values of a jaxpr and of those within it."""
+    for equation in jaxpr.eqns:
+        yield from (var.aval for var in (*equation.invars, *equation.outvars))
+        inner = jax.tree.leaves(equation.params, is_leaf=lambda p: hasattr(p, "eqns") or hasattr(p, "jaxpr"))
+        for part in (getattr(param, "jaxpr", param) for param in inner):
+            if hasattr(part, "eqns"):
+                yield from avals_in(part)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_with_64_bits_enabled_the_bits_are_those_without(preset):
+    config, cloud = DetectorConfig.presets()[preset], street()
+    expected = jax.device_get(detect(cloud, config))
+    with enable_x64(True):
+        assert_same_bits(detect(cloud, config), expected)
+        wide = jax.tree.map(lambda a: jnp.asarray(a, a.dtype.kind + "8"), cloud)
+        assert wide.xyz1.dtype == jnp.float64
+        assert_same_bits(detect(wide, jax.tree.map(jnp.float64, config)), expected)
+
+
+def test_with_64_bits_enabled_a_batch_has_the_bits_of_the_singles():
+    clouds = [street(seed) for seed in (0, 1)]
+    with enable_x64(True):
+        many = jax.vmap(paper)(stack_clouds(clouds))
+    for row, cloud in enumerate(clouds):
+        assert_same_bits(row_of(many, row), paper(cloud))
+
+
+@pytest.mark.parametrize("accelerator", [False, True])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_with_64_bits_enabled_the_program_computes_in_32(preset, accelerator):
+    config, clouds = DetectorConfig.presets()[preset], stack_clouds([street(), street()])
+    with devices.building_for(accelerator=accelerator), enable_x64(True):
+        many = jax.make_jaxpr(jax.vmap(lambda cloud: detect(cloud, config)))(clouds)
+        single = jax.make_jaxpr(lambda cloud: detect(cloud, config))(street())
+    for program in (single, many):
+        avals = [aval for aval in avals_in(program.jaxpr) if hasattr(aval, "dtype")]
+        assert len(avals) > 1000
+        # Python's numbers, and in JAX 0.6 the place of an entry that is known, are of 64 bits.
+        assert not [aval for aval in avals if str(aval.dtype) in WIDE and aval.size > 2]
+
+
+@pytest.mark.parametrize("accelerator", [False, True])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_no_type_and_no_rank_is_promoted(preset, accelerator):
+    strict = jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise")
+    config = DetectorConfig.presets()[preset]
+    with devices.building_for(accelerator=accelerator), strict[0], strict[1]:
+        answer = jax.eval_shape(jax.jit(lambda cloud: detect(cloud, config)), street())
+    assert answer.valid.shape == (config.vehicles.max_detections,)
+
+
+def assert_same_boxes(many, clouds):
+    """Those of the singles, but for rounding: XLA makes a program for several devices by other passes."""
+    for row, cloud in enumerate(clouds):
+        found, expected = row_of(many, row), paper(cloud)
+        for name in ("center", "size", "yaw", "score"):
+            np.testing.assert_allclose(getattr(found, name), getattr(expected, name), atol=1e-4)
+        for name in ("label", "valid", "status"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+        assert found.valid.any()
+
+
+def spread(clouds, axis_type):
+    """The clouds as a batch over two devices, and their mesh."""
+    mesh = jax.make_mesh((2,), ("sweeps",), axis_types=(axis_type,))
+    sharding = jax.sharding.NamedSharding(mesh, SWEEPS)
+    return jax.device_put(stack_clouds(clouds), sharding), mesh
+
+
+@pytest.mark.skipif(jax.__version_info__ < (0, 10), reason="explicit meshes of older JAX know no scatters")
+def test_a_batch_over_an_explicit_mesh_is_found_where_it_is():
+    clouds = [street(seed) for seed in range(4)]
+    batch, mesh = spread(clouds, jax.sharding.AxisType.Explicit)
+    many = jax.jit(jax.vmap(paper))(batch)
+    assert many.valid.sharding.is_equivalent_to(jax.sharding.NamedSharding(mesh, SWEEPS), 2)
+    assert_same_boxes(many, clouds)
+
+
+# The third type, Manual, is what a mesh becomes within shard_map.
+@pytest.mark.parametrize("axis_type", [jax.sharding.AxisType.Auto, jax.sharding.AxisType.Explicit])
+def test_a_batch_over_a_mesh_of_any_type_goes_through_shard_map(axis_type):
+    clouds = [street(seed) for seed in range(4)]
+    batch, mesh = spread(clouds, axis_type)
+    find = jax.shard_map(jax.vmap(paper), mesh=mesh, in_specs=SWEEPS, out_specs=SWEEPS, check_vma=False)
+    many = jax.jit(find)(batch)
+    assert many.valid.sharding.device_set == set(mesh.devices.flat)
+    assert_same_boxes(many, clouds)
+
+
+@pytest.mark.parametrize("through", ["grad", "jit", "vmap", "jvp"])
+def test_a_gradient_is_refused_in_a_sentence(through):
+    cloud, x = street(), jnp.float32(1)
+
+    def total_score(scale):
+        return paper(dataclasses.replace(cloud, xyz1=scale * cloud.xyz1)).score.sum()
+
+    asked = {
+        "grad": jax.grad(total_score),
+        "jit": jax.jit(jax.grad(total_score)),
+        "vmap": lambda x: jax.grad(lambda scales: jax.vmap(total_score)(scales).sum())(x[None]),
+        "jvp": lambda x: jax.jvp(total_score, (x,), (x,)),
+    }
+    with pytest.raises(TypeError, match=r"jaxbox\.detect is not differentiable, since"):
+        asked[through](x)
+
+
+def test_a_gradient_of_what_follows_is_there():
+    cloud = street()
+
+    def weighted(scale):
+        held = jax.lax.stop_gradient(scale) * cloud.xyz1
+        return scale * paper(dataclasses.replace(cloud, xyz1=held)).score.sum()
+
+    assert jax.grad(weighted)(1.0) == weighted(1.0) > 0
+
+
+def test_an_exported_function_of_clouds_and_settings_is_serialized_and_called_again():
+    cloud, config = street(), DetectorConfig.paper()
+    written = jax.export.export(jax.jit(detect))(cloud, config).serialize()
+    again = jax.export.deserialize(written)
+    found = again.call(cloud, config)
+    assert jax.tree.structure(found) == jax.tree.structure(paper(cloud))
+    assert_same_bits(found, paper(cloud))
+    # The static settings are part of what it takes.
+    with pytest.raises(ValueError, match="structure"):
+        again.call(cloud, DetectorConfig())
+
+
+def test_where_all_is_on_the_device_nothing_is_transferred():
+    cloud, config = street(), DetectorConfig.paper()
+    expected, on_device = paper(cloud), jax.device_put(cloud)
+    with jax.transfer_guard("disallow"):
+        with pytest.raises(Exception, match=r"[Dd]isallowed host-to-device transfer"):
+            jnp.zeros(3) + np.ones(3, np.float32)
+        # The second call has its thresholds there already.
+        first, second = detect(on_device, config), detect(on_device, config)
+        keyed = jax.jit(paper)(on_device)
+    for found in (first, second, keyed):
+        assert_same_bits(found, expected)
