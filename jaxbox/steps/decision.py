@@ -239,6 +239,6 @@ def _best_first(score: jax.Array, num: jax.Array) -> jax.Array:
 
     if on_accelerator():
         place = _num_better(score)
-        return jnp.full(size, size, jnp.int32).at[jnp.where(score > 0, place, size)].set(row, mode="drop")
-    place = for_chunks(num, RANK_STEP, step, jnp.zeros_like(row), capacity=size)
+    else:
+        place = for_chunks(num, RANK_STEP, step, jnp.zeros_like(row), capacity=size)
     return jnp.full(size, size, jnp.int32).at[jnp.where(score > 0, place, size)].set(row, mode="drop")

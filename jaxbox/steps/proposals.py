@@ -109,6 +109,11 @@ def _for_maps(num_maps: int, step: Callable[[jax.Array, Any], Any], state: Any) 
     return jax.lax.fori_loop(jnp.uint32(0), jnp.uint32(num_maps), step, state)
 
 
+def _chunk_size(num_rows: int) -> int:
+    """Points taken at a time: on an accelerator all."""
+    return num_rows if on_accelerator() else CHUNK
+
+
 def _chunk(values: jax.Array, start: jax.Array) -> jax.Array:
     """Rows of a chunk; zeros beyond the last."""
     if on_accelerator():
@@ -119,12 +124,11 @@ def _chunk(values: jax.Array, start: jax.Array) -> jax.Array:
 
 def _on_map(table: jax.Array, i: jax.Array, start: jax.Array) -> jax.Array:
     """(CHUNK,) what a table (maps, O) says of a chunk of points on map i."""
-    size = table.shape[1] if on_accelerator() else CHUNK
-    return jax.lax.dynamic_slice(table, (i, start), (1, size))[0]
+    return jax.lax.dynamic_slice(table, (i, start), (1, _chunk_size(table.shape[1])))[0]
 
 
 def _store(table: jax.Array, i: jax.Array, start: jax.Array, values: jax.Array) -> jax.Array:
-    return jax.lax.dynamic_update_slice(table, values[None], (i, start))
+    return jax.lax.dynamic_update_slice(table, jnp.atleast_2d(values), (i, start))
 
 
 def _find_cells(
@@ -145,7 +149,7 @@ def _find_cells(
     )
 
     size = obstacles.height.shape[0]
-    row = jnp.arange(size if on_accelerator() else CHUNK, dtype=jnp.int32)
+    row = jnp.arange(_chunk_size(size), dtype=jnp.int32)
 
     def step(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         table, flags = state
@@ -156,10 +160,10 @@ def _find_cells(
         # One scatter for all maps reads and writes the flags once, which counts in a batch on an accelerator.
         for i, cell in enumerate([jnp.stack(found)] if on_accelerator() else found):
             flags = flags.at[cells.flag(cell)].set(1, mode="promise_in_bounds")
-            table = jax.lax.dynamic_update_slice(table, jnp.atleast_2d(cell), (jnp.uint32(i), start))
+            table = _store(table, jnp.uint32(i), start, cell)
         return table, flags
 
-    table = jnp.zeros((len(maps), size if on_accelerator() else size + -size % CHUNK), jnp.int32)
+    table = jnp.zeros((len(maps), size + -size % _chunk_size(size)), jnp.int32)
     return _fold_chunks(step, (table, jnp.zeros(cells.num_flags, jnp.uint8)), obstacles)
 
 
