@@ -17,9 +17,9 @@ import numpy as np
 
 from benchmarks import bench_accuracy, common
 from jaxbox import DetectorConfig
+from jaxbox.config.fields import replace_settings
 from jaxbox.evaluation.copies import COPIES, Copy, Frame, label_points, read_frame
 from jaxbox.io import open_sweeps
-from jaxbox.settings import replace_settings
 
 FULL = "default preset"
 NO_LIMIT = 1e6

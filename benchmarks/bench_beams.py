@@ -21,11 +21,11 @@ from benchmarks import common
 from benchmarks.bench_accuracy import MIN_OVERLAP, RECALLS
 from benchmarks.bench_sensors import RIGHT_OVERLAP
 from jaxbox import DEFAULT_CUT, DetectorConfig, Label
+from jaxbox._padding import fitting_capacity
+from jaxbox.config.sensors import TUNED_BEAMS
 from jaxbox.evaluation import Selection, kitti, matching, pairwise_overlaps, report, thin_beams
 from jaxbox.evaluation.copies import COPIES, Copy, Frame, detect_copy, read_frame
 from jaxbox.io import open_sweeps, read_drives
-from jaxbox.padding import fitting_capacity
-from jaxbox.sensors import TUNED_BEAMS
 from jaxbox.synthetic import SyntheticSweep, make_sweep
 
 DRIVES_FILE = common.PROJECT / "benchmarks" / "kitti_drives.txt"

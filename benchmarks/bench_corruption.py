@@ -22,11 +22,11 @@ import numpy as np
 
 from benchmarks import common
 from jaxbox import DEFAULT_CUT, DetectorConfig
+from jaxbox._padding import fitting_capacity
 from jaxbox.evaluation import Selection, kitti, matching
 from jaxbox.evaluation.copies import COPIES, Copy, Frame, detect_copy, read_frame
 from jaxbox.evaluation.corruptions import CORRUPTIONS, Corruption
 from jaxbox.io import open_sweeps
-from jaxbox.padding import fitting_capacity
 from jaxbox.viz.plots import save_figure
 
 CLEAN = "clean"

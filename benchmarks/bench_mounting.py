@@ -17,8 +17,8 @@ from benchmarks import common
 from benchmarks.bench_beams import measure
 from jaxbox import DetectorConfig
 from jaxbox.evaluation.copies import Frame, read_frame
+from jaxbox.geometry.mounting import Mounting, measure_mounting
 from jaxbox.io import objects_from_detections, open_sweeps
-from jaxbox.mounting import Mounting, measure_mounting
 
 CASES: dict[str, dict[str, float]] = {
     "as recorded": {},

@@ -26,9 +26,9 @@ import numpy as np
 import jaxbox
 from benchmarks import common
 from jaxbox import DetectorConfig, PointCloud
+from jaxbox._padding import CAPACITY_BUCKETS
 from jaxbox.evaluation.copies import Copy, turn_points
 from jaxbox.io import Sweep
-from jaxbox.padding import CAPACITY_BUCKETS
 
 BATCHES, QUICK_BATCHES = (1, 2, 4, 8, 16, 32, 64), (1, 4)
 VMAPPED, QUICK_VMAPPED = (4, 64), (4,)

@@ -16,10 +16,10 @@ import numpy as np
 
 import jaxbox
 from jaxbox import Detections, DetectorConfig, PointCloud, Status
-from jaxbox.cache import cache_folder, keep_compiled, make_private
+from jaxbox.config.fields import parse_change, replace_settings
 from jaxbox.io import Sweep, atomic_writer, open_sweeps
-from jaxbox.settings import parse_change, replace_settings
-from jaxbox.workers import THREADS_VARIABLE
+from jaxbox.run.cache import cache_folder, keep_compiled, make_private
+from jaxbox.run.processes import THREADS_VARIABLE
 
 PROJECT = pathlib.Path(__file__).resolve().parents[1]
 

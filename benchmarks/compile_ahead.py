@@ -12,7 +12,7 @@ from jax.sharding import NamedSharding, PartitionSpec
 
 from benchmarks import common
 from jaxbox import DetectorConfig, PointCloud, detector
-from jaxbox.devices import building_for
+from jaxbox.xla.backend import building_for
 
 WHEELS = ("jax-cuda12-pjrt", "jax-cuda12-plugin", "nvidia-cuda-nvcc-cu12")
 """Packages with the compiler: of 223 MB, without a driver or CUDA's libraries."""

@@ -15,7 +15,7 @@ from benchmarks.hlo_text import Frame
 from benchmarks.launch_model import Turns
 from benchmarks.xla_dump import key_of
 from jaxbox import DetectorConfig, PointCloud, detector
-from jaxbox.devices import building_for
+from jaxbox.xla.backend import building_for
 
 CALLS = ("jit", "pjit", "closed_call")
 """Calls of functions whose equations are counted as if they stood in the caller."""

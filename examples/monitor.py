@@ -21,8 +21,8 @@ import numpy as np
 
 import jaxbox
 from jaxbox import Detections, DetectorConfig, PointCloud, Status, io, synthetic
-from jaxbox.cache import enable_cache
-from jaxbox.summary import Summary
+from jaxbox.run.cache import enable_cache
+from jaxbox.run.summary import Summary
 
 FAST_SWEEPS, SLOW_SWEEPS = 4, 100
 """Sweeps over which the two means forget."""
@@ -162,7 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     config, monitor, totals = DetectorConfig(), Monitor(deadline_ms=options.deadline_ms), [0, 0, 0]
     for name, detections, latency_ms in detect_each(sweeps, config):
-        summary = detections.summary(config)
+        summary = jaxbox.summarise(detections, config)
         alarms = monitor.judge(summary, latency_ms)
         totals = [totals[0] + 1, totals[1] + bool(alarms), totals[2] + (latency_ms > options.deadline_ms)]
         line = {"sweep": name, "latency_ms": round(latency_ms, 1), **signals_of(summary), "alarms": alarms}

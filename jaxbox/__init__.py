@@ -1,13 +1,14 @@
 """jaxbox: training-free LiDAR vehicle detection as one compiled JAX function."""
 
-from jaxbox import serialization as _serialization  # noqa: F401 - jax.export learns the types below
-from jaxbox.batching import detect_batch
-from jaxbox.cache import enable_cache
-from jaxbox.config import DEFAULT_CUT, DetectorConfig
+from jaxbox._version import __version__
+from jaxbox.config import DEFAULT_CUT, DetectorConfig, propose_capacities
 from jaxbox.detector import detect
-from jaxbox.streaming import StreamedSweep, stream
+from jaxbox.run import serialization as _serialization  # noqa: F401 - jax.export learns the types below
+from jaxbox.run.batching import detect_batch
+from jaxbox.run.cache import enable_cache
+from jaxbox.run.streaming import StreamedSweep, stream
+from jaxbox.run.summary import Summary, summarise
 from jaxbox.types import Calibration, Detections, GroundPlane, Hulls, Label, PointCloud, Status, stack_clouds
-from jaxbox.version import __version__
 
 __all__ = [
     "DEFAULT_CUT",
@@ -20,10 +21,13 @@ __all__ = [
     "PointCloud",
     "Status",
     "StreamedSweep",
+    "Summary",
     "__version__",
     "detect",
     "detect_batch",
     "enable_cache",
+    "propose_capacities",
     "stack_clouds",
     "stream",
+    "summarise",
 ]

@@ -11,13 +11,13 @@ import numpy as np
 
 from jaxbox import steps
 from jaxbox.config import DetectorConfig
-from jaxbox.devices import batch_together, building_for, default_device, is_on_device, on_accelerator
-from jaxbox.evidence import Evidence
-from jaxbox.loops import AT_ONCE, apart, at_once
+from jaxbox.stages.evidence import Evidence
 from jaxbox.steps.boxes import Fits
 from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals
 from jaxbox.types import Detections, PointCloud
+from jaxbox.xla.backend import batch_together, building_for, default_device, is_on_device, on_accelerator
+from jaxbox.xla.loops import AT_ONCE, apart, at_once
 
 
 class Segments(NamedTuple):
@@ -64,7 +64,7 @@ def detect(
 
 
 class Programs(Protocol):
-    """What `detect` asks first, where the cache is on: `jaxbox.programs.KeptPrograms`."""
+    """What `detect` asks first, where the cache is on: `jaxbox.run.programs.KeptPrograms`."""
 
     @property
     def num_compiled(self) -> int:

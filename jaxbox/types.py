@@ -13,18 +13,12 @@ Conventions, project-wide:
 import dataclasses
 import enum
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox.padding import aligned_empty, checked_points, fill_rows, fitting_capacity
-
-if TYPE_CHECKING:
-    from jaxbox.config import DetectorConfig
-    from jaxbox.summary import Summary
-
+from jaxbox._padding import aligned_empty, checked_points, fill_rows, fitting_capacity
 
 GROUND_ABOVE_M = 0.5
 """A ground plane that passes so high over the origin lies above the sensor: where recordings are in their
@@ -408,26 +402,6 @@ class Detections:
         failures = [_overflow_text(bit, self.counts) for bit in _OVERFLOW_BITS if bit in status]
         if failures:
             raise RuntimeError("\n".join(failures))
-
-    def summary(self, config: "DetectorConfig | None" = None, *, min_score: float | None = None) -> "Summary":
-        """Gathers what a system alarms on: counts a stage, how full each capacity was, boxes, the ground.
-
-        It waits for the answer and works on the host, on that of one sweep: of a batch, take one row by
-        `jax.tree.map` first.
-
-        Args:
-          config: the settings that `detect` had, which say how large each capacity is; None for the default.
-          min_score: boxes that score less are left out; None for `jaxbox.DEFAULT_CUT`.
-
-        Returns:
-          See `jaxbox.summary.Summary`; its `to_dict` is for JSON.
-        """
-        # Here, as the summary is made of these types and of the configuration.
-        from jaxbox.config import DEFAULT_CUT, DetectorConfig  # noqa: PLC0415
-        from jaxbox.summary import summarise  # noqa: PLC0415
-
-        config = DetectorConfig() if config is None else config
-        return summarise(self, config, min_score=DEFAULT_CUT if min_score is None else min_score)
 
 
 _OVERFLOW_BITS = (

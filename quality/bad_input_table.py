@@ -17,7 +17,7 @@ import jax
 import jaxbox
 from benchmarks import common
 from jaxbox import DetectorConfig, PointCloud, Status
-from jaxbox.settings import replace_settings
+from jaxbox.config.fields import replace_settings
 from jaxbox.types import NUM_POINT_COUNTS
 from quality import bad_input
 

@@ -23,7 +23,7 @@ import jaxbox
 from benchmarks import bench_sensors, common
 from jaxbox import Detections, DetectorConfig, PointCloud
 from jaxbox.evaluation import pairwise_overlaps
-from jaxbox.workers import THREADS_VARIABLE
+from jaxbox.run.processes import THREADS_VARIABLE
 from quality.bad_input import PRESETS, street
 
 REPEATS, QUICK_REPEATS = 100, 10

@@ -29,7 +29,7 @@ import warnings
 from collections.abc import Callable
 from typing import Any
 
-WATCHED = ["jaxbox.io", "jaxbox.settings", "pypcd4", "laspy", "rosbags", "mcap", "tomllib", "zipfile"]
+WATCHED = ["jaxbox.io", "jaxbox.config.fields", "pypcd4", "laspy", "rosbags", "mcap", "tomllib", "zipfile"]
 """Modules whose branches guide the fuzzer; code that is not Python is a black box to it."""
 UNWATCHED = ["rosbags.typesys"]
 """Of these: tables of every message there is, which take a minute to prepare."""

@@ -22,13 +22,13 @@ from rosbags.typesys import Stores, get_typestore
 
 from jaxbox import DetectorConfig, io
 from jaxbox.cli.results import RunAccount
+from jaxbox.config.fields import settings_to_toml
 from jaxbox.io import foxglove
 from jaxbox.io.jsonl import JSONL
 from jaxbox.io.mcap_results import MCAP_RESULTS
 from jaxbox.io.parquet import PARQUET
 from jaxbox.io.results import ResultFile, SweepResult
 from jaxbox.io.rosbag import MessageDecoder
-from jaxbox.settings import settings_to_toml
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 STORES = {1: get_typestore(Stores.ROS1_NOETIC), 2: get_typestore(Stores.ROS2_HUMBLE)}

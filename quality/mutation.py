@@ -28,13 +28,15 @@ from typing import Any
 from benchmarks import common
 
 TESTS: Mapping[str, str] = {
-    "jaxbox/geometry.py": "tests/test_geometry.py",
+    "jaxbox/geometry/planar.py": "tests/test_geometry.py",
     "jaxbox/evaluation/iou.py": "tests/test_evaluation_iou.py jaxbox/evaluation/iou.py",
-    "jaxbox/projection.py": "tests/test_projection.py",
-    "jaxbox/descriptors.py": "tests/test_parity_boxes.py -k 'descriptors and not real'",
-    "jaxbox/hull.py": "tests/test_parity_boxes.py -k 'hull or extreme'",
-    "jaxbox/box.py": "tests/test_parity_boxes.py -k '(synthetic or direction) and not hull and not extreme'",
-    "jaxbox/masked.py": "tests/test_masked.py",
+    "jaxbox/geometry/projection.py": "tests/test_projection.py",
+    "jaxbox/stages/descriptors.py": "tests/test_parity_boxes.py -k 'descriptors and not real'",
+    "jaxbox/stages/hull.py": "tests/test_parity_boxes.py -k 'hull or extreme'",
+    "jaxbox/stages/rectangles.py": (
+        "tests/test_parity_boxes.py -k '(synthetic or direction) and not hull and not extreme'"
+    ),
+    "jaxbox/xla/masked.py": "tests/test_masked.py",
 }
 """The fast tests of each module, as arguments of pytest."""
 

@@ -25,8 +25,8 @@ import numpy as np
 import jaxbox
 from benchmarks import common
 from jaxbox import DetectorConfig, detector
+from jaxbox._padding import CAPACITY_BUCKETS, fitting_capacity
 from jaxbox.io import open_sweeps
-from jaxbox.padding import CAPACITY_BUCKETS, fitting_capacity
 from quality.bad_input import street
 
 FRAMES, QUICK_FRAMES = 20_000, 200

@@ -10,7 +10,7 @@ import jax
 import parity
 import pytest
 
-from jaxbox import devices
+from jaxbox.xla import backend
 
 DATA = pathlib.Path(os.environ.get("JAXBOX_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
 
@@ -98,7 +98,7 @@ def platform(request, monkeypatch):
     shares one a form, a `parity.PerForm`.
     """
     asked = []
-    chosen = devices._for_accelerator
+    chosen = backend._for_accelerator
 
     class Watched:
         """The context variable, which notes that it was read."""
@@ -109,7 +109,7 @@ def platform(request, monkeypatch):
 
         set, reset = chosen.set, chosen.reset
 
-    monkeypatch.setattr(devices, "_for_accelerator", Watched())
-    with devices.building_for(accelerator=request.param == "accelerator"):
+    monkeypatch.setattr(backend, "_for_accelerator", Watched())
+    with backend.building_for(accelerator=request.param == "accelerator"):
         yield request.param
     assert asked, "Traced before: jit a function of the test's own, or a parity.PerForm."

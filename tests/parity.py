@@ -13,10 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox import devices, reference, synthetic
-from jaxbox.box import PointLists
+from jaxbox import reference, synthetic
 from jaxbox.config import ComponentMap, DetectorConfig
-from jaxbox.evidence import BLOCK, Evidence, _free_words, _hit_words
 from jaxbox.reference.proposals import (
     Obstacles,
     Proposal,
@@ -25,6 +23,9 @@ from jaxbox.reference.proposals import (
     make_proposals,
     select_options,
 )
+from jaxbox.stages.evidence import BLOCK, Evidence, _free_words, _hit_words
+from jaxbox.stages.rectangles import PointLists
+from jaxbox.xla import backend
 
 NUM_SEEDS = 20
 REAL_FRAMES = ("000001", "000008", "000080", "000134", "001497")
@@ -60,7 +61,7 @@ class PerForm:
     @property
     def jitted(self) -> Any:
         """The jitted function of the form that is asked for in this context."""
-        return self._of_form[devices.on_accelerator()]
+        return self._of_form[backend.on_accelerator()]
 
     def __call__(self, *args: Any, **named: Any) -> Any:
         return self.jitted(*args, **named)
@@ -70,7 +71,7 @@ def in_both_forms(function, *args, **named):
     """What a function that reads the platform, a `PerForm` say, gives for a CPU and for an accelerator."""
     results = []
     for accelerator in (False, True):
-        with devices.building_for(accelerator=accelerator):
+        with backend.building_for(accelerator=accelerator):
             results.append(on_host(function(*args, **named)))
     return results
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxbox import DetectorConfig, steps
-from jaxbox.settings import replace_settings
+from jaxbox.config.fields import replace_settings
 
 
 @pytest.fixture

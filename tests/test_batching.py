@@ -9,8 +9,9 @@ import pytest
 from test_detector import CAPACITY, assert_same_bits, found, run, street
 
 import jaxbox
-from jaxbox import DetectorConfig, PointCloud, batching, detect_batch, detector, streaming
+from jaxbox import DetectorConfig, PointCloud, detect_batch, detector
 from jaxbox.config import EvidenceConfig
+from jaxbox.run import batching, streaming
 
 SEEDS = (0, 1, 2)
 

@@ -9,11 +9,12 @@ import numpy as np
 import parity
 import pytest
 
-from jaxbox import DetectorConfig, devices, masked, steps
+from jaxbox import DetectorConfig, steps
 from jaxbox.config import ComponentMap
 from jaxbox.steps import decision
 from jaxbox.steps.points import Obstacles
 from jaxbox.steps.proposals import CHUNK
+from jaxbox.xla import backend, masked
 
 ROOM = CHUNK + 900
 """Rows for obstacles: no whole number of chunks."""
@@ -24,7 +25,7 @@ def test_a_function_per_form_keeps_the_program_of_each():
     values = np.arange(700, dtype=np.int32)
     loops = []
     for accelerator in (False, True, False, True):
-        with devices.building_for(accelerator=accelerator):
+        with backend.building_for(accelerator=accelerator):
             np.testing.assert_array_equal(total(values), np.cumsum(values))
             loops.append(total.jitted.lower(values).as_text().count("stablehlo.while"))
     assert loops == [1, 0, 1, 0]

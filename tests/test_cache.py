@@ -11,11 +11,12 @@ from test_detector import CAPACITY, assert_same_bits, found, street
 from typer.testing import CliRunner
 
 import jaxbox
-from jaxbox import PointCloud, cache, detector, programs
-from jaxbox.cache import CacheFolders, CacheWarning, cache_folder, make_private
+from jaxbox import PointCloud, detector
 from jaxbox.cli import app
+from jaxbox.config.fields import replace_settings
 from jaxbox.detector import count_compilations
-from jaxbox.settings import replace_settings
+from jaxbox.run import cache, programs
+from jaxbox.run.cache import CacheFolders, CacheWarning, cache_folder, make_private
 
 PROJECT = pathlib.Path(__file__).parents[1]
 

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 import jaxbox
-from jaxbox import cache, synthetic
+from jaxbox import synthetic
 from jaxbox.cli import app, demo, eval_pictures
 from jaxbox.cli.report import (
     SHOWN_MIN_SCORE,
@@ -35,8 +35,9 @@ from jaxbox.io import (
     write_calibration,
     write_labels,
 )
+from jaxbox.run import cache
+from jaxbox.run.processes import THREADS_VARIABLE
 from jaxbox.types import PointCloud, Status
-from jaxbox.workers import THREADS_VARIABLE
 
 # Few beams, so that all sweeps of this file share the smallest capacity and one compile.
 CAPACITY = 16384

@@ -16,12 +16,13 @@ from test_io_formats import write_foxglove
 from typer.testing import CliRunner
 
 import jaxbox
-from jaxbox import cache, io
+from jaxbox import io
 from jaxbox.cli import app, sweep_info
 from jaxbox.config import DetectorConfig
 from jaxbox.io import mcap_results, parquet
 from jaxbox.io import rerun as rerun_results
 from jaxbox.io.results import SweepResult
+from jaxbox.run import cache
 from jaxbox.types import PointCloud
 
 ALL = [word for name in ("jsonl", "parquet", "mcap", "rerun") for word in ("--format", name)]

@@ -12,8 +12,9 @@ import pytest
 from test_cli import make_small_sweep, run, write_points
 from test_io_formats import write_foxglove
 
-from jaxbox import cache, io, workers
+from jaxbox import io
 from jaxbox.cli.results import Results
+from jaxbox.run import cache, processes
 
 COMMON = ("--preset", "paper", "--format", "both", "--format", "parquet", "--format", "mcap")
 BROKEN = "000001"
@@ -61,7 +62,7 @@ def account_of(output):
 
 
 def test_two_jobs_write_the_files_of_one_though_a_worker_is_killed(street, alone, tmp_path, monkeypatch):
-    call, killed = workers._Process.call, []
+    call, killed = processes._Process.call, []
 
     def kill_once(process, item):
         if item.name == "000002" and not killed:
@@ -69,7 +70,7 @@ def test_two_jobs_write_the_files_of_one_though_a_worker_is_killed(street, alone
             os.kill(process._process.pid, signal.SIGKILL)
         return call(process, item)
 
-    monkeypatch.setattr(workers._Process, "call", kill_once)
+    monkeypatch.setattr(processes._Process, "call", kill_once)
     result = run("detect", street, "--output", tmp_path, *COMMON, "--jobs", "2")
     output, one = alone
     assert result.exit_code == one.exit_code == 1

@@ -8,10 +8,11 @@ import pytest
 from typer.testing import CliRunner
 
 import jaxbox
-from jaxbox import cache, synthetic
+from jaxbox import synthetic
 from jaxbox.cli import app
 from jaxbox.detector import count_compilations
 from jaxbox.io import objects_from_detections, read_config, write_bin, write_calibration, write_labels
+from jaxbox.run import cache
 from jaxbox.tuning import Bench
 from jaxbox.types import PointCloud
 

@@ -22,8 +22,7 @@ import pytest
 from test_cli import make_small_sweep, run, write_points
 from test_io_formats import write_foxglove
 
-from jaxbox import cache, io
-from jaxbox.cache import CacheFolders
+from jaxbox import io
 from jaxbox.cli import detect_ray
 from jaxbox.cluster import (
     ClusterError,
@@ -39,7 +38,9 @@ from jaxbox.cluster.store import Store
 from jaxbox.cluster.worker import Attempt, Partition, PartitionWorker, Task
 from jaxbox.config import DetectorConfig
 from jaxbox.io.parquet import PARQUET_COLUMNS
-from jaxbox.versions import versions
+from jaxbox.run import cache
+from jaxbox.run.cache import CacheFolders
+from jaxbox.run.versions import versions
 
 # Ray Data's settings warn of their own old names.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:ray")

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from jaxbox import DetectorConfig, PointCloud, Status, detect
-from jaxbox.capacities import CAPACITY_STEP
 from jaxbox.config import (
     BoxConfig,
     ClusteringConfig,
@@ -15,7 +14,9 @@ from jaxbox.config import (
     ComponentMap,
     EvidenceConfig,
     RegionConfig,
+    propose_capacities,
 )
+from jaxbox.config.schema import CAPACITY_STEP
 from jaxbox.io import open_sweeps
 from jaxbox.synthetic import make_sweep
 
@@ -114,7 +115,7 @@ def test_proposals_count_points_above_the_lowest_near_them():
     base = one_map(cell_m=0.25, max_height_m=1.0)
     counts = {}
     for height_m in (0.1, 0.5, 2.0, 5.0):
-        sizes = proposed(DetectorConfig.for_sweeps([blocks(1500, height_m)], base=base, margin=1))
+        sizes = proposed(propose_capacities([blocks(1500, height_m)], base=base, margin=1))
         counts[height_m] = tuple(size // CAPACITY_STEP for size in sizes)
     # 1500 points take two steps: ground, within the slab and the map, above both, and overhead.
     assert counts == {0.1: (1, 1, 1), 0.5: (2, 2, 2), 2.0: (2, 1, 1), 5.0: (1, 1, 1)}
@@ -122,24 +123,24 @@ def test_proposals_count_points_above_the_lowest_near_them():
 
 def test_proposals_count_cells_not_points():
     base = one_map(cell_m=2.0)
-    assert proposed(DetectorConfig.for_sweeps([blocks(1500, 0.5)], base=base))[2] == CAPACITY_STEP
+    assert proposed(propose_capacities([blocks(1500, 0.5)], base=base))[2] == CAPACITY_STEP
 
 
 def test_proposals_hold_the_largest_sweep_times_the_margin():
     base = one_map(cell_m=0.25)
     sweeps = [blocks(10, 0.5), blocks(1000, 0.5), blocks(0, 0.5)]
-    assert proposed(DetectorConfig.for_sweeps(sweeps, base=base, margin=1)) == (1024, 1024, 1024)
-    assert proposed(DetectorConfig.for_sweeps(iter(sweeps), base=base)) == (2048, 2048, 2048)
-    assert proposed(DetectorConfig.for_sweeps(sweeps, base=base, margin=2.5)) == (3072, 3072, 3072)
+    assert proposed(propose_capacities(sweeps, base=base, margin=1)) == (1024, 1024, 1024)
+    assert proposed(propose_capacities(iter(sweeps), base=base)) == (2048, 2048, 2048)
+    assert proposed(propose_capacities(sweeps, base=base, margin=2.5)) == (3072, 3072, 3072)
 
 
 @pytest.mark.parametrize("preset", DetectorConfig.presets())
 def test_proposals_leave_everything_else_as_in_the_base(preset):
     base = DetectorConfig.presets()[preset]
-    config = DetectorConfig.for_sweeps([blocks(900, 0.5)], base=base)
+    config = propose_capacities([blocks(900, 0.5)], base=base)
     assert without_proposals(config) == without_proposals(base)
     assert all(type(size) is int for size in proposed(config))
-    assert DetectorConfig.for_sweeps([blocks(900, 0.5)]).completion == DetectorConfig().completion
+    assert propose_capacities([blocks(900, 0.5)]).completion == DetectorConfig().completion
 
 
 @pytest.mark.parametrize(
@@ -148,29 +149,29 @@ def test_proposals_leave_everything_else_as_in_the_base(preset):
     ids=["empty", "NaN", "far away", "integers"],
 )
 def test_sweeps_without_anything_get_the_least_capacity(points):
-    config = DetectorConfig.for_sweeps([points])
+    config = propose_capacities([points])
     assert set(proposed(config)) == {CAPACITY_STEP}
 
 
 def test_points_far_away_or_not_finite_change_no_proposal():
     sweep = blocks(900, 0.5)
     worse = np.concatenate([sweep, [[np.nan, 0, 0], [np.inf, 0, 0], [500, 0, 1], [0, -500, 1]]])
-    assert DetectorConfig.for_sweeps([worse]) == DetectorConfig.for_sweeps([sweep])
+    assert propose_capacities([worse]) == propose_capacities([sweep])
 
 
 def test_bad_arguments_of_proposals_are_refused_saying_which():
     with pytest.raises(ValueError, match="no sweeps"):
-        DetectorConfig.for_sweeps([])
+        propose_capacities([])
     with pytest.raises(ValueError, match=r"sweep 1 has shape \(5, 4\).*points\[:, :3\]"):
-        DetectorConfig.for_sweeps([np.zeros((5, 3)), np.zeros((5, 4))])
+        propose_capacities([np.zeros((5, 3)), np.zeros((5, 4))])
     for margin in (0.9, -1, float("nan")):
         with pytest.raises(ValueError, match=r"margin is .*at least 1"):
-            DetectorConfig.for_sweeps([np.zeros((5, 3))], margin=margin)
+            propose_capacities([np.zeros((5, 3))], margin=margin)
 
 
 def test_the_proposed_capacities_hold_the_sweeps_they_were_proposed_for():
     sweeps = [make_sweep(seed, num_beams=32, num_azimuths=520).xyz for seed in range(3)]
-    config = DetectorConfig.for_sweeps(sweeps, base=LIGHT)
+    config = propose_capacities(sweeps, base=LIGHT)
     # Smaller than the base's, or there would be no need to propose.
     assert all(
         size < m.max_cells for size, m in zip(proposed(config)[2:], LIGHT.clustering.maps, strict=True)
@@ -187,7 +188,7 @@ def test_the_rough_look_at_real_sweeps_proposes_enough(data_root):
     default = DetectorConfig()
     for frame in frames:
         xyz = frame.read_points()[0]
-        config = DetectorConfig.for_sweeps([xyz])
+        config = propose_capacities([xyz])
         counts = detect(PointCloud.from_numpy(xyz, capacity=2**17), default).counts
         true = np.array([counts.obstacles, counts.slab_points, *counts.cells])
         assert (true <= proposed(config)).all(), frame

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from test_masked import count_loops
 
-from jaxbox import DetectorConfig, PointCloud, Status, detect, detector, devices, stack_clouds, synthetic
+from jaxbox import DetectorConfig, PointCloud, Status, detect, detector, stack_clouds, synthetic
 from jaxbox.config import BoxConfig, EvidenceConfig
-from jaxbox.geometry import rectangle_iou
+from jaxbox.geometry.planar import rectangle_iou
 from jaxbox.io import open_sweeps
+from jaxbox.xla import backend
 from quality import bad_input
 
 CAPACITY = 2**14
@@ -180,7 +181,7 @@ def batch_anew(clouds):
 
 def test_a_batch_for_an_accelerator_has_the_shapes_of_the_singles_and_an_axis_more():
     clouds = stack_clouds([PointCloud.from_numpy(street(seed).xyz, capacity=CAPACITY) for seed in (0, 1)])
-    with devices.building_for(accelerator=True):
+    with backend.building_for(accelerator=True):
         find, operands = batch_anew(clouds)
     assert_shapes_of_singles(jax.eval_shape(find, *operands), 2)
 
@@ -189,7 +190,7 @@ def test_a_batch_on_an_accelerator_finds_what_the_singles_do_on_a_cpu():
     sweeps = [street(0).xyz, np.zeros((0, 3)), street(1).xyz]
     clouds = stack_clouds([PointCloud.from_numpy(xyz, capacity=CAPACITY) for xyz in sweeps])
     # Run here, where it is slower: all sweeps at once, and each loop in its form for accelerators.
-    with devices.building_for(accelerator=True):
+    with backend.building_for(accelerator=True):
         find, operands = batch_anew(clouds)
     many = jax.device_get(find(*operands))
     for row, xyz in enumerate(sweeps):

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbox import DetectorConfig, PointCloud, detect, detector, devices, export, synthetic
+from jaxbox import DetectorConfig, PointCloud, detect, detector, synthetic
+from jaxbox.run import export
+from jaxbox.xla import backend
 
 CAPACITY = 2**14
 MAX_LOOPS = 3
@@ -66,33 +68,33 @@ def test_an_export_for_both_kinds_gives_the_bits_of_detect_on_a_cpu():
 
 def test_the_decision_is_by_the_context_then_the_arrays_device_then_the_default():
     here = jax.device_put(jnp.zeros(3), jax.devices("cpu")[0])
-    assert not devices.on_accelerator()
-    with devices.building_for(accelerator=True):
-        assert devices.on_accelerator()
-        assert devices.on_accelerator(here)
-        with devices.building_for(accelerator=False):
-            assert not devices.on_accelerator()
-    assert not devices.on_accelerator(here)
+    assert not backend.on_accelerator()
+    with backend.building_for(accelerator=True):
+        assert backend.on_accelerator()
+        assert backend.on_accelerator(here)
+        with backend.building_for(accelerator=False):
+            assert not backend.on_accelerator()
+    assert not backend.on_accelerator(here)
 
 
 def test_an_array_is_computed_with_where_it_is_and_all_else_by_default(monkeypatch):
-    monkeypatch.setattr(devices, "default_device", lambda: jax.devices("cpu")[1])
-    assert devices.platform_of(np.zeros(3)) == "cpu"
+    monkeypatch.setattr(backend, "default_device", lambda: jax.devices("cpu")[1])
+    assert backend.platform_of(np.zeros(3)) == "cpu"
 
     class Gpu:
         platform = "gpu"
 
-    monkeypatch.setattr(devices, "default_device", Gpu)
-    assert devices.platform_of(np.zeros(3)) == devices.platform_of(None) == "gpu"
-    assert devices.platform_of(jax.device_put(1.0, jax.devices("cpu")[0])) == "cpu"
+    monkeypatch.setattr(backend, "default_device", Gpu)
+    assert backend.platform_of(np.zeros(3)) == backend.platform_of(None) == "gpu"
+    assert backend.platform_of(jax.device_put(1.0, jax.devices("cpu")[0])) == "cpu"
     # A tracer is nowhere yet.
-    assert jax.eval_shape(lambda x: jnp.int32(devices.on_accelerator(x)) + x, 0).dtype == jnp.int32
+    assert jax.eval_shape(lambda x: jnp.int32(backend.on_accelerator(x)) + x, 0).dtype == jnp.int32
 
 
 def test_the_default_device_is_the_one_that_jax_is_told():
     first, second = jax.devices("cpu")[:2]
-    assert devices.default_device() == first
+    assert backend.default_device() == first
     with jax.default_device(second):
-        assert devices.default_device() == second
+        assert backend.default_device() == second
     with jax.default_device("cpu"):
-        assert devices.default_device() == first
+        assert backend.default_device() == first

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from kitti_objects import car
 
-from jaxbox import evaluation, geometry
+from jaxbox import evaluation
 from jaxbox.evaluation import matching, report
+from jaxbox.geometry import planar
 from jaxbox.io import InputError, KittiObject, open_sweeps, write_bin, write_labels
 
 ALL = matching.Selection()
@@ -192,7 +193,7 @@ def test_counted_points_do_not_depend_on_how_the_scene_is_turned(seed):
     assert counts.min() > 0
 
     def turned(points):
-        xy = np.asarray(geometry.rotate(jnp.asarray(points[:, :2]), jnp.full(len(points), 0.7)))
+        xy = np.asarray(planar.rotate(jnp.asarray(points[:, :2]), jnp.full(len(points), 0.7)))
         return np.column_stack([xy, points[:, 2]])
 
     again = matching.count_points_in_boxes(turned(xyz), turned(center), size, yaw + 0.7)

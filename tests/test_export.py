@@ -10,8 +10,9 @@ import pytest
 from test_detector import CAPACITY, found, street
 from typer.testing import CliRunner
 
-from jaxbox import PointCloud, export
+from jaxbox import PointCloud
 from jaxbox.cli import app
+from jaxbox.run import export
 
 LOAD = """
 import sys

@@ -15,8 +15,9 @@ import pytest
 from test_cli import make_small_sweep, run, write_points
 from test_cli_formats import heard_ctrl_c, records_of
 
-from jaxbox import cache, io
+from jaxbox import io
 from jaxbox.io import parquet
+from jaxbox.run import cache
 
 FORMATS = [word for name in ("kitti", "jsonl", "parquet", "mcap") for word in ("--format", name)]
 

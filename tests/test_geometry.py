@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbox import geometry
+from jaxbox.geometry import planar
 
-iou = jax.jit(jax.vmap(geometry.rectangle_iou))
-pair_iou = jax.jit(geometry.rectangle_iou)
+iou = jax.jit(jax.vmap(planar.rectangle_iou))
+pair_iou = jax.jit(planar.rectangle_iou)
 CAR = jnp.array([30.0, -12.0, 3.9, 1.6, 0.4])
 
 
@@ -128,7 +128,7 @@ def test_rectangle_iou_is_symmetric():
     ],
 )
 def test_rectangle_iou_of_parallel_boxes_is_that_computed_by_hand(turn, shift, size, expected):
-    offset = np.asarray(geometry.rotate(jnp.array(shift), jnp.float32(turn)))
+    offset = np.asarray(planar.rotate(jnp.array(shift), jnp.float32(turn)))
     a = jnp.array([50.0, 20.0, 4.0, 2.0, turn])
     b = jnp.array([50.0 + offset[0], 20.0 + offset[1], *size, turn])
     np.testing.assert_allclose(pair_iou(a, b), expected, atol=1e-5)
@@ -149,7 +149,7 @@ def test_rectangle_iou_does_not_change_when_the_scene_is_turned_and_moved():
     turn, shift = 1.1, np.float32([30, -60])
 
     def moved(boxes: np.ndarray) -> np.ndarray:
-        xy = np.asarray(geometry.rotate(boxes[:, :2], jnp.full(len(boxes), turn))) + shift
+        xy = np.asarray(planar.rotate(boxes[:, :2], jnp.full(len(boxes), turn))) + shift
         return np.column_stack([xy, boxes[:, 2:4], boxes[:, 4] + np.float32(turn)])
 
     # Turning about a far origin rounds coordinates of about 100 m to some 1e-5 m.
@@ -158,14 +158,14 @@ def test_rectangle_iou_does_not_change_when_the_scene_is_turned_and_moved():
 
 def test_rectangle_iou_of_a_pair_equals_that_pair_in_a_batch():
     a, b = random_boxes(5, 8), random_boxes(6, 8)
-    matrix = jax.jit(jax.vmap(jax.vmap(geometry.rectangle_iou, (None, 0)), (0, None)))(a, b)
-    single = [[float(geometry.rectangle_iou(p, q)) for q in jnp.asarray(b)] for p in jnp.asarray(a)]
+    matrix = jax.jit(jax.vmap(jax.vmap(planar.rectangle_iou, (None, 0)), (0, None)))(a, b)
+    single = [[float(planar.rectangle_iou(p, q)) for q in jnp.asarray(b)] for p in jnp.asarray(a)]
     np.testing.assert_allclose(matrix, single, atol=1e-6)
 
 
 def test_rectangle_intersection_never_exceeds_the_smaller_box():
     a, b = random_boxes(9, 5000), random_boxes(10, 5000)
-    shared = np.asarray(jax.jit(jax.vmap(geometry.rectangle_intersection))(a, b))
+    shared = np.asarray(jax.jit(jax.vmap(planar.rectangle_intersection))(a, b))
     smaller = np.minimum(a[:, 2] * a[:, 3], b[:, 2] * b[:, 3])
     assert (shared >= 0).all()
     assert (shared <= smaller * (1 + 1e-6)).all()
@@ -173,11 +173,11 @@ def test_rectangle_intersection_never_exceeds_the_smaller_box():
 
 def test_wrap_yaw_is_half_open_and_keeps_the_axis():
     yaw = jnp.linspace(-20, 20, 4001)
-    wrapped = geometry.wrap_yaw(yaw)
+    wrapped = planar.wrap_yaw(yaw)
     assert float(wrapped.min()) >= -np.pi / 2
     assert float(wrapped.max()) < np.pi / 2
     np.testing.assert_allclose(jnp.cos(2 * wrapped), jnp.cos(2 * yaw), atol=1e-4)
-    assert float(geometry.wrap_yaw(jnp.float32(np.pi / 2))) == pytest.approx(-np.pi / 2)
+    assert float(planar.wrap_yaw(jnp.float32(np.pi / 2))) == pytest.approx(-np.pi / 2)
 
 
 def test_wrap_yaw_beside_its_seam_is_in_range_but_for_the_last_bit():
@@ -188,7 +188,7 @@ def test_wrap_yaw_beside_its_seam_is_in_range_but_for_the_last_bit():
         for _ in range(6):
             beside = np.nextafter(beside, np.float32(direction))
             yaw.append(beside)
-    wrapped = np.asarray(jax.jit(geometry.wrap_yaw)(np.stack(yaw)))
+    wrapped = np.asarray(jax.jit(planar.wrap_yaw)(np.stack(yaw)))
     half = np.float32(np.pi / 2)
     assert wrapped.min() >= np.nextafter(-half, np.float32(-np.inf))
     assert wrapped.max() < half
@@ -196,11 +196,11 @@ def test_wrap_yaw_beside_its_seam_is_in_range_but_for_the_last_bit():
 
 
 def test_rotate_is_counter_clockwise():
-    np.testing.assert_allclose(geometry.rotate(jnp.array([1.0, 0.0]), jnp.pi / 2), [0, 1], atol=1e-6)
+    np.testing.assert_allclose(planar.rotate(jnp.array([1.0, 0.0]), jnp.pi / 2), [0, 1], atol=1e-6)
 
 
 def test_rectangle_corners_run_counter_clockwise_from_front_left():
-    corners = geometry.rectangle_corners(jnp.array([10.0, 0.0]), jnp.array([4.0, 2.0]), jnp.float32(0))
+    corners = planar.rectangle_corners(jnp.array([10.0, 0.0]), jnp.array([4.0, 2.0]), jnp.float32(0))
     np.testing.assert_allclose(corners, [[12, 1], [8, 1], [8, -1], [12, -1]], atol=1e-6)
     x, y = np.asarray(corners).T
     assert np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) / 2 == pytest.approx(8)

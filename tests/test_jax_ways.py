@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbox import DetectorConfig, PointCloud, detect, devices, stack_clouds, synthetic
+from jaxbox import DetectorConfig, PointCloud, detect, stack_clouds, synthetic
+from jaxbox.xla import backend
 
 CAPACITY = 4096
 PRESETS = sorted(DetectorConfig.presets())
@@ -71,7 +72,7 @@ def test_with_64_bits_enabled_a_batch_has_the_bits_of_the_singles():
 @pytest.mark.parametrize("preset", PRESETS)
 def test_with_64_bits_enabled_the_program_computes_in_32(preset, accelerator):
     config, clouds = DetectorConfig.presets()[preset], stack_clouds([street(), street()])
-    with devices.building_for(accelerator=accelerator), enable_x64(True):
+    with backend.building_for(accelerator=accelerator), enable_x64(True):
         many = jax.make_jaxpr(jax.vmap(lambda cloud: detect(cloud, config)))(clouds)
         single = jax.make_jaxpr(lambda cloud: detect(cloud, config))(street())
     for program in (single, many):
@@ -86,7 +87,7 @@ def test_with_64_bits_enabled_the_program_computes_in_32(preset, accelerator):
 def test_no_type_and_no_rank_is_promoted(preset, accelerator):
     strict = jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise")
     config = DetectorConfig.presets()[preset]
-    with devices.building_for(accelerator=accelerator), strict[0], strict[1]:
+    with backend.building_for(accelerator=accelerator), strict[0], strict[1]:
         answer = jax.eval_shape(jax.jit(lambda cloud: detect(cloud, config)), street())
     assert answer.valid.shape == (config.vehicles.max_detections,)
 

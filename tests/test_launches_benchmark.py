@@ -13,7 +13,7 @@ from benchmarks import bench_launches, compile_ahead, hlo_text, launch_model, lo
 from benchmarks.launch_model import Counts, Turns
 from benchmarks.xla_dump import Thunk
 from jaxbox import DetectorConfig, PointCloud, detector
-from jaxbox.devices import building_for
+from jaxbox.xla.backend import building_for
 
 TREE = """\
 000: kCommandBuffer [source | next=003 (1)]
@@ -61,8 +61,8 @@ HloModule jit_counted_detect, is_scheduled=true
 
 FileNames
 1 "/somewhere/jaxbox/detector.py"
-2 "/somewhere/jaxbox/ground.py"
-3 "/somewhere/jaxbox/loops.py"
+2 "/somewhere/jaxbox/stages/ground.py"
+3 "/somewhere/jaxbox/xla/loops.py"
 
 FunctionNames
 1 "_segment"
@@ -180,7 +180,7 @@ def test_a_stack_goes_from_the_line_outward():
         "remove_ground",
         "_segment",
     ]
-    assert stack[0] == ("/somewhere/jaxbox/loops.py", 125, "for_chunks")
+    assert stack[0] == ("/somewhere/jaxbox/xla/loops.py", 125, "for_chunks")
     assert hlo_text.step_of(stack) == "remove_ground"
     assert xla_dump.key_of(stack) == OUTER
     assert hlo_text.Stacks(HLO)(0) == ()

@@ -17,12 +17,12 @@ from test_detector import CAPACITY, assert_same_bits, run
 from test_projection import make_calibration, oracle_uvw
 
 from jaxbox import DetectorConfig, PointCloud, Status, detect, detect_batch, io, stack_clouds, synthetic
-from jaxbox.box import PointLists, best_rectangles, try_rotations
+from jaxbox.config.fields import settings_from_toml, settings_to_toml
 from jaxbox.evaluation import pairwise_overlaps
-from jaxbox.hull import convex_hulls, polygon_area
+from jaxbox.geometry.projection import project_boxes
 from jaxbox.io.kitti import KittiObject
-from jaxbox.projection import project_boxes
-from jaxbox.settings import settings_from_toml, settings_to_toml
+from jaxbox.stages.hull import convex_hulls, polygon_area
+from jaxbox.stages.rectangles import PointLists, best_rectangles, try_rotations
 from quality import bad_input
 
 SWEEPS = settings(max_examples=max(settings.default.max_examples // 5, 1))

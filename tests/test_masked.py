@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbox import devices, grouping, loops, masked
+from jaxbox.xla import backend, loops, masked, sorting
 
 SIZES = (1, 2, masked.BLOCK - 1, masked.BLOCK, masked.BLOCK + 1, 3 * masked.BLOCK + 7)
 
@@ -160,7 +160,7 @@ def test_what_stands_behind_a_wall_is_computed_once_for_all_who_read_it(wall, pl
 
     x = jax.device_put(np.linspace(0, 9, 5000, dtype=np.float32), jax.devices("cpu")[0])
     program = jax.jit(read_twice).lower(x).compile()
-    has_wall = not devices.on_accelerator() and wall in walls
+    has_wall = not backend.on_accelerator() and wall in walls
     assert program.as_text().count(" sine(") == (1 if has_wall else 2)
     np.testing.assert_array_equal(program(x)[1], 2 * np.asarray(jnp.sin(x))[::-1])
 
@@ -213,7 +213,7 @@ SORTS = [(1, 1), (2, 1), (1000, 40), (3000, 3000), (4095, 2**20 - 1), (4096, 2**
 def test_sort_by_group_is_a_stable_sort_of_the_first_rows_on_every_platform(size, num_groups):
     num_used = min(num_groups, 40)
     group = np.random.default_rng(size).integers(0, num_used, size, np.int32) * (num_groups // num_used)
-    sort = jax.jit(lambda n: grouping.sort_by_group(lambda i: (i, -i), group, n, num_groups, room=3))
+    sort = jax.jit(lambda n: sorting.sort_by_group(lambda i: (i, -i), group, n, num_groups, room=3))
     for num_rows in (0, 1, size * 7 // 10, size):
         (rows, minus), begin, end = sort(jnp.int32(num_rows))
         assert rows.shape == minus.shape == (size + 3,)
@@ -226,7 +226,7 @@ def test_sort_by_group_is_a_stable_sort_of_the_first_rows_on_every_platform(size
 
 def test_both_sorts_of_sort_by_group_are_tried_above():
     def num_operands(size, num_groups):
-        order = functools.partial(grouping._stable_order, num_groups=num_groups)
+        order = functools.partial(sorting._stable_order, num_groups=num_groups)
         jaxpr = jax.make_jaxpr(order)(jax.ShapeDtypeStruct((size,), jnp.int32))
         return [len(eqn.invars) for eqn in jaxpr.eqns if eqn.primitive.name == "sort"]
 
@@ -237,7 +237,7 @@ def test_both_sorts_of_sort_by_group_are_tried_above():
 @pytest.mark.parametrize("max_size", [1, 9, 128])
 def test_largest_first_is_a_stable_sort_by_descending_size_on_every_platform(max_size):
     size = np.random.default_rng(max_size).integers(0, max_size + 1, 700, np.int32)
-    order, place = grouping.largest_first(jnp.asarray(size), max_size)
+    order, place = sorting.largest_first(jnp.asarray(size), max_size)
     np.testing.assert_array_equal(order, np.argsort(-size, kind="stable"))
     np.testing.assert_array_equal(order[place], np.arange(700))
 
@@ -276,7 +276,7 @@ def test_the_toolbox_gives_the_same_under_jit_and_vmap():
 
     def both(mask):
         index, count = masked.compact(mask, 64)
-        order, begin, end = grouping.sort_by_group(lambda i: i, jnp.where(mask, 0, 1), jnp.sum(mask), 2)
+        order, begin, end = sorting.sort_by_group(lambda i: i, jnp.where(mask, 0, 1), jnp.sum(mask), 2)
         return index, count, order, begin, end
 
     singles = [both(mask) for mask in masks]

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from jaxbox import io, synthetic
-from jaxbox.mounting import MAX_TILT_DEG, MIN_SENSOR_HEIGHT_M, ROOF_HEIGHT_M, Mounting, measure_mounting
+from jaxbox.geometry.mounting import (
+    MAX_TILT_DEG,
+    MIN_SENSOR_HEIGHT_M,
+    ROOF_HEIGHT_M,
+    Mounting,
+    measure_mounting,
+)
 
 SWEEP = synthetic.make_sweep(3, num_beams=32, num_azimuths=520)
 SENSOR_HEIGHT_M = 1.73

@@ -55,7 +55,7 @@ def test_types_are_marked_and_shipped():
 
 def test_the_version_is_written_in_one_place():
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())
-    assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "jaxbox.version.__version__"}
+    assert project["tool"]["setuptools"]["dynamic"]["version"] == {"attr": "jaxbox._version.__version__"}
     assert project["project"]["dynamic"] == ["version"]
     assert importlib.metadata.version("jaxbox") == jaxbox.__version__
     written = [
@@ -63,7 +63,7 @@ def test_the_version_is_written_in_one_place():
         for path in (PROJECT / "jaxbox").rglob("*.py")
         if f'"{jaxbox.__version__}"' in path.read_text()
     ]
-    assert written == ["version.py"]
+    assert written == ["_version.py"]
 
 
 def test_every_extra_is_in_the_documentation():

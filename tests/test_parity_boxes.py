@@ -13,9 +13,11 @@ import parity
 import pytest
 from test_masked import count_loops
 
-from jaxbox import DetectorConfig, box, descriptors, hull, reference, steps
+from jaxbox import DetectorConfig, reference, steps
 from jaxbox.config import HullConfig
-from jaxbox.loops import map_rows
+from jaxbox.stages import descriptors, hull
+from jaxbox.stages import rectangles as box
+from jaxbox.xla.loops import map_rows
 
 SETTINGS = parity.CONFIG.box
 CRITERIA = ("area", "variance", "closeness", "visible_closeness")

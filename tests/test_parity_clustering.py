@@ -10,9 +10,12 @@ import pytest
 from scipy import ndimage
 from test_masked import count_loops
 
-from jaxbox import box, clustering, devices, reference, selection
+from jaxbox import reference
 from jaxbox.config import ComponentMap, DetectorConfig
 from jaxbox.reference.clusters import NO_CLUSTER
+from jaxbox.stages import clustering, selection
+from jaxbox.stages import rectangles as box
+from jaxbox.xla import backend
 
 SETTINGS = parity.CONFIG.clustering
 WARP = {"start_m": SETTINGS.adaptive_start_m, "growth": SETTINGS.adaptive_growth}
@@ -227,7 +230,7 @@ def test_the_first_rounds_are_not_enough_for_the_comb(monkeypatch):
     # Or the test above would not need the loop that goes on.
     label = parity.PerForm(label_cells.function, static_argnames=("row", "max_runs"))
     monkeypatch.setattr(jax.lax, "while_loop", lambda _, __, state: state)
-    with devices.building_for(accelerator=True):
+    with backend.building_for(accelerator=True):
         assert len(set(label_grid(LONG_WAYS["comb"], label))) > 1
 
 

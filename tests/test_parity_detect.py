@@ -8,7 +8,8 @@ import parity
 import pytest
 
 import jaxbox
-from jaxbox import DetectorConfig, devices, reference
+from jaxbox import DetectorConfig, reference
+from jaxbox.xla import backend
 
 MIN_SCORE = 0.05
 PRESETS = DetectorConfig.presets()
@@ -36,13 +37,13 @@ def num_partners(boxes, others):
 
 
 def detect(case, preset):
-    return detect_in_form(case, preset, devices.on_accelerator())
+    return detect_in_form(case, preset, backend.on_accelerator())
 
 
 @functools.cache
 def detect_in_form(case, preset, accelerator):
     cloud = jaxbox.PointCloud.from_numpy(case.xyz, capacity=parity.CAPACITY)
-    with devices.building_for(accelerator=accelerator):
+    with backend.building_for(accelerator=accelerator):
         return parity.on_host(jaxbox.detect(cloud, PRESETS[preset]))
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import parity
 import pytest
 
-from jaxbox import completion, evidence, reference
+from jaxbox import reference
+from jaxbox.stages import completion, evidence
 from jaxbox.steps.boxes import complete_trials
 from jaxbox.steps.proposals import Trials
 from jaxbox.types import NOT_A_BOX, Boxes, Rectangles

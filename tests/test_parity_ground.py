@@ -7,7 +7,8 @@ import numpy as np
 import parity
 import pytest
 
-from jaxbox import filtering, ground, reference
+from jaxbox import reference
+from jaxbox.stages import filtering, ground
 
 FILTER = parity.all_options(parity.CONFIG.filtering, "enabled")
 GROUND = parity.CONFIG.ground

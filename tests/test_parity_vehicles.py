@@ -8,7 +8,10 @@ import numpy as np
 import parity
 import pytest
 
-from jaxbox import devices, geometry, reference, vehicles
+from jaxbox import reference
+from jaxbox.geometry import planar
+from jaxbox.stages import scoring as vehicles
+from jaxbox.xla import backend
 
 SETTINGS = parity.CONFIG.vehicles
 AROUND = parity.select_options(SETTINGS, "margin_m", "ring_m", "upper_height_m", "stray_share")
@@ -43,7 +46,7 @@ count_points_around = parity.PerForm(
     functools.partial(vehicles.count_points_around, **parity.REGION, **AROUND)
 )
 suppress = parity.PerForm(vehicles.suppress)
-rectangle_iou = jax.jit(jax.vmap(geometry.rectangle_iou))
+rectangle_iou = jax.jit(jax.vmap(planar.rectangle_iou))
 
 
 def boxes_of(case, rng):
@@ -258,7 +261,7 @@ def test_the_chains_are_longer_than_the_rounds_without_a_look(monkeypatch):
     # Or the test above would not need the loop that goes on.
     boxes = HEAPS["a chain"]
     monkeypatch.setattr(jax.lax, "while_loop", lambda _, __, state: state)
-    with devices.building_for(accelerator=True):
+    with backend.building_for(accelerator=True):
         keep = vehicles.suppress(boxes, jnp.ones(len(boxes), bool), max_overlap=SETTINGS.max_overlap)
     assert not np.array_equal(np.flatnonzero(keep), np.arange(0, len(boxes), 2))
 

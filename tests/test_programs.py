@@ -17,9 +17,10 @@ import pytest
 from test_detector import CAPACITY, assert_same_bits, found, street
 
 import jaxbox
-from jaxbox import DetectorConfig, PointCloud, detector, program_files, programs
-from jaxbox.program_files import SUFFIX, BrokenProgramError, read_made_of
-from jaxbox.programs import Half, KeptPrograms
+from jaxbox import DetectorConfig, PointCloud, detector
+from jaxbox.run import program_files, programs
+from jaxbox.run.program_files import SUFFIX, BrokenProgramError, read_made_of
+from jaxbox.run.programs import Half, KeptPrograms
 
 PROJECT = pathlib.Path(__file__).parents[1]
 BASE = DetectorConfig()

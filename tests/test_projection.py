@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxbox import io
-from jaxbox.projection import (
+from jaxbox.geometry.projection import (
     BOX_EDGES,
     ProjectedBoxes,
     box_corners,

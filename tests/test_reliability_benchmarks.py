@@ -113,12 +113,12 @@ def test_coverage_is_summed_by_part():
         return {"summary": summary, **missing}
 
     files = {
-        "jaxbox/hull.py": entry(10, 0, 2, 0),
+        "jaxbox/detector.py": entry(10, 0, 2, 0),
         "jaxbox/io/a.py": entry(20, 2, 8, 2),
         "jaxbox/io/b.py": entry(30, 0, 2, 0),
     }
     parts = coverage_table.by_part(files)
-    assert list(parts) == ["io", "hull", "all"]
+    assert list(parts) == ["io", "detector", "all"]
     assert parts["io"] | {"percent": 0} == {
         "lines": 50, "lines missed": 2, "branches": 10, "branches missed": 2, "percent": 0,
     }  # fmt: skip

@@ -10,12 +10,12 @@ import pytest
 from typer.testing import CliRunner
 
 from jaxbox import DEFAULT_CUT, DetectorConfig, io, synthetic
-from jaxbox.capacities import CAPACITY_STEP
 from jaxbox.cli import app, sweep_info
 from jaxbox.cli.settings import chosen_config
+from jaxbox.config.fields import changed_settings, settings_from_toml
+from jaxbox.config.schema import CAPACITY_STEP
+from jaxbox.config.sensors import SENSORS, fitting_sensor
 from jaxbox.evaluation import thin_beams
-from jaxbox.sensors import SENSORS, fitting_sensor
-from jaxbox.settings import changed_settings, settings_from_toml
 
 
 @pytest.mark.parametrize("preset", DetectorConfig.presets())

@@ -7,7 +7,7 @@ import pytest
 
 from jaxbox import io
 from jaxbox.config import ComponentMap, DetectorConfig
-from jaxbox.settings import (
+from jaxbox.config.fields import (
     changed_settings,
     check_traced,
     parse_change,

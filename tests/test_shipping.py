@@ -14,9 +14,10 @@ import pytest
 from test_detector import CAPACITY, run, street
 
 import jaxbox
-from jaxbox import DetectorConfig, programs, shipping
-from jaxbox.program_files import SUFFIX
-from jaxbox.shipping import ship_programs, shipped_state
+from jaxbox import DetectorConfig
+from jaxbox.run import programs, shipping
+from jaxbox.run.program_files import SUFFIX
+from jaxbox.run.shipping import ship_programs, shipped_state
 
 PROJECT = pathlib.Path(__file__).parents[1]
 
@@ -25,7 +26,8 @@ import pathlib, sys
 import jax, numpy as np
 jax.config.update("jax_num_cpu_devices", 2)  # as the other tests, whose compiled functions it takes
 import jaxbox
-from jaxbox import programs, shipping
+from jaxbox.run import programs
+from jaxbox.run import shipping
 config, root = jaxbox.DetectorConfig.paper(), pathlib.Path(jaxbox.__file__).parent
 assert root == pathlib.Path(sys.argv[1]), root
 if sys.argv[2] == "ship":

@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 
 import jaxbox
-from jaxbox import DetectorConfig, PointCloud, Status, ground, summary, synthetic
+from jaxbox import DetectorConfig, PointCloud, Status, synthetic
 from jaxbox.config import ClusteringConfig, ComponentMap
+from jaxbox.run import summary
+from jaxbox.stages import ground
 
 # The smallest capacity, whose compiled function other tests use too.
 CAPACITY, NUM_AZIMUTHS = 16384, 250
@@ -40,7 +42,7 @@ def monitor():
 
 def test_every_point_is_in_one_place_and_the_shares_sum_to_one(found):
     sweep, detections = found
-    result = detections.summary()
+    result = jaxbox.summarise(detections)
     assert result.num_points == len(sweep.xyz) == sum(result.points.values())
     assert sum(map(result.point_share, summary.POINT_PLACES)) == pytest.approx(1)
     assert set(result.points) < {field.name for field in dataclasses.fields(detections.counts)}
@@ -51,7 +53,7 @@ def test_every_point_is_in_one_place_and_the_shares_sum_to_one(found):
 def test_boxes_are_those_from_the_cut_on(found):
     _, detections = found
     for cut in (0.0, 0.05, jaxbox.DEFAULT_CUT):
-        result = detections.summary(min_score=cut)
+        result = jaxbox.summarise(detections, min_score=cut)
         keep = detections.valid & (detections.score >= cut)
         assert result.num_boxes == keep.sum() == sum(result.boxes.values())
         assert result.num_boxes > 0
@@ -63,18 +65,18 @@ def test_boxes_are_those_from_the_cut_on(found):
         assert result.range_m.least == pytest.approx(
             np.linalg.norm(detections.center[keep, :2], axis=1).min()
         )
-    assert detections.summary().min_score == jaxbox.DEFAULT_CUT
+    assert jaxbox.summarise(detections).min_score == jaxbox.DEFAULT_CUT
 
 
 def test_no_box_above_the_cut_leaves_the_spreads_empty(found):
-    result = found[1].summary(min_score=2.0)
+    result = jaxbox.summarise(found[1], min_score=2.0)
     assert (result.num_boxes, result.boxes) == (0, {"car": 0, "van": 0, "truck": 0})
     assert result.score == result.length_m == summary.Spread(None, None, None)
 
 
 def test_the_ground_is_the_plane_as_the_mount_has_it(found):
     _, detections = found
-    result = detections.summary().ground
+    result = jaxbox.summarise(detections).ground
     assert result.found
     assert result.sensor_height_m == pytest.approx(-synthetic_ground_height(), abs=0.05)
     assert result.tilt_deg < 0.5
@@ -83,7 +85,7 @@ def test_the_ground_is_the_plane_as_the_mount_has_it(found):
     slanted = dataclasses.replace(
         detections.ground, coefficients=jnp.array([-0.75, 0, -5.0]), num_inliers=jnp.int32(800)
     )
-    result = dataclasses.replace(detections, ground=slanted).summary().ground
+    result = jaxbox.summarise(dataclasses.replace(detections, ground=slanted)).ground
     assert result.sensor_height_m == pytest.approx(4.0)
     assert result.tilt_deg == pytest.approx(math.degrees(math.atan(0.75)))
     assert result.inlier_share == pytest.approx(0.25)
@@ -107,18 +109,20 @@ def test_the_share_of_inliers_is_of_as_many_candidates_as_the_ground_has():
 
 def test_capacities_are_those_of_the_configuration_and_say_what_was_dropped(found):
     _, detections = found
-    uses = {use.field: use for use in detections.summary().capacities}
+    uses = {use.field: use for use in jaxbox.summarise(detections).capacities}
     assert uses["clustering.max_obstacles"].capacity == 3 * CAPACITY // 4
     assert uses["clustering.maps.2.max_cells"].capacity == DetectorConfig().clustering.maps[2].max_cells
     assert uses["vehicles.max_detections"].needed == detections.valid.sum()
-    assert detections.summary().dropped == {}
+    assert jaxbox.summarise(detections).dropped == {}
     small = DetectorConfig(
         clustering=ClusteringConfig(maps=(ComponentMap(max_cells=10), ComponentMap(), ComponentMap()))
     )
     # As a run with this capacity would have counted.
     cells = int(detections.counts.cells[0])
-    assert detections.summary(small).dropped == {"clustering.maps.0.max_cells": cells - 10}
-    use = {use.field: use for use in detections.summary(small).capacities}["clustering.maps.0.max_cells"]
+    assert jaxbox.summarise(detections, small).dropped == {"clustering.maps.0.max_cells": cells - 10}
+    use = {use.field: use for use in jaxbox.summarise(detections, small).capacities}[
+        "clustering.maps.0.max_cells"
+    ]
     assert use.share == cells / 10
 
 
@@ -126,12 +130,12 @@ def test_the_capacities_of_a_hull_fit_have_no_slab(found):
     config = DetectorConfig.paper()
     maps = DetectorConfig().clustering.maps
     config = dataclasses.replace(config, clustering=dataclasses.replace(config.clustering, maps=maps))
-    assert "box.max_slab_points" not in {use.field for use in found[1].summary(config).capacities}
+    assert "box.max_slab_points" not in {use.field for use in jaxbox.summarise(found[1], config).capacities}
 
 
 def test_the_dictionary_is_json_and_has_the_status_in_words(found):
     detections = dataclasses.replace(found[1], status=jnp.int32(Status.NO_GROUND | Status.NONFINITE_POINTS))
-    text = json.dumps(detections.summary().to_dict(), allow_nan=False)
+    text = json.dumps(jaxbox.summarise(detections).to_dict(), allow_nan=False)
     back = json.loads(text)
     assert [sentence.split(":")[0] for sentence in back["status"]] == ["NONFINITE_POINTS", "NO_GROUND"]
     assert back["capacities"]["hull.max_vertices"]["dropped"] == 0
@@ -141,7 +145,7 @@ def test_the_dictionary_is_json_and_has_the_status_in_words(found):
 
 def test_an_empty_sweep_has_a_summary(found):
     cloud = PointCloud.from_numpy(np.zeros((0, 3), np.float32), capacity=CAPACITY)
-    result = jax.device_get(jaxbox.detect(cloud)).summary()
+    result = jaxbox.summarise(jax.device_get(jaxbox.detect(cloud)))
     assert result.num_points == result.num_boxes == 0
     assert result.status == Status.EMPTY | Status.NO_GROUND
     assert result.point_share("ground_points") == 0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxbox.config import DetectorConfig
-from jaxbox.settings import replace_settings, traced_settings
+from jaxbox.config.fields import replace_settings, traced_settings
 from jaxbox.tuning import Axis, best_trial, default_axes, latin_hypercube, leave_one_out, parse_axis, refine
 from jaxbox.tuning.selection import NOISE, Trial, score_without
 

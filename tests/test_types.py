@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jaxbox import Label, PointCloud, Status, detect, stack_clouds
+from jaxbox._padding import CAPACITY_BUCKETS
 from jaxbox.config import (
     BoxConfig,
     ClusteringConfig,
@@ -21,7 +22,6 @@ from jaxbox.config import (
     HullConfig,
     VehicleConfig,
 )
-from jaxbox.padding import CAPACITY_BUCKETS
 from jaxbox.synthetic import make_sweep
 
 POINTS = np.random.default_rng(0).normal(0, 20, (50, 3)).astype(np.float32)

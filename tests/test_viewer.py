@@ -19,11 +19,13 @@ from viewer_sweeps import write_kitti, write_three_streets
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from jaxbox import DetectorConfig, PointCloud, cache, io
+from jaxbox import DetectorConfig, PointCloud, io
 from jaxbox.cli import view as view_command
+from jaxbox.config import propose_capacities
+from jaxbox.config.fields import check_traced
 from jaxbox.detector import count_compilations
 from jaxbox.io import _extras
-from jaxbox.settings import check_traced
+from jaxbox.run import cache
 from jaxbox.types import Status
 from jaxbox.viewer import (
     COLORINGS,
@@ -284,7 +286,7 @@ def test_the_copied_settings_are_read_back(preset, tmp_path):
 
 
 def test_settings_of_no_preset_are_copied_whole(tmp_path):
-    given = DetectorConfig.for_sweeps([street(0).xyz], base=DetectorConfig.fast())
+    given = propose_capacities([street(0).xyz], base=DetectorConfig.fast())
     file = tmp_path / "copied.toml"
     file.write_text(settings_text(given, None, min_score=0.3))
     assert io.read_config(file) == given

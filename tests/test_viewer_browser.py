@@ -10,7 +10,7 @@ from test_detector import street
 from viewer_sweeps import write_three_streets
 
 from jaxbox import DetectorConfig, PointCloud, detect, io
-from jaxbox.settings import settings_from_toml
+from jaxbox.config.fields import settings_from_toml
 from jaxbox.viewer import View, Wanted, open_viewer
 from jaxbox.viz import BoxSet
 from jaxbox.viz.colors import ESTIMATE

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jaxbox import projection, viz
+from jaxbox import viz
+from jaxbox.geometry import projection
 from jaxbox.io import read_image
 from jaxbox.types import Calibration
 from jaxbox.viz.boxes import bird_eye_iou, find_matches

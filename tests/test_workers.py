@@ -10,8 +10,8 @@ import time
 import numpy as np
 import pytest
 
-from jaxbox import workers
-from jaxbox.workers import ProcessPool, WorkerDied, ahead
+from jaxbox.run import processes
+from jaxbox.run.processes import ProcessPool, WorkerDied, ahead
 
 
 class NoPickle(Exception):
@@ -106,7 +106,7 @@ def test_arrays_arrive_as_they_were_sent():
 
 
 def test_leaving_early_ends_the_processes_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(workers, "_END_S", 1e6)
+    monkeypatch.setattr(processes, "_END_S", 1e6)
     begun = []
 
     def work_and_leave():

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from jaxbox.cache import enable_cache
+from jaxbox._version import __version__
 from jaxbox.cli.console import cache_warnings, input_errors, stdout
 from jaxbox.cli.demo import run_demo
 from jaxbox.cli.detect import DetectOptions, ResultFormat, run_detect
@@ -25,7 +25,7 @@ from jaxbox.cluster.dataset import SWEEPS_PER_PARTITION
 from jaxbox.evaluation.copies import COPIES
 from jaxbox.evaluation.objectives import OBJECTIVES
 from jaxbox.io import InputError
-from jaxbox.version import __version__
+from jaxbox.run.cache import enable_cache
 
 PresetOption = Annotated[
     str | None,

@@ -14,8 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.progress import TimeRemainingColumn as _TimeLeft
 from rich.text import Text
 
-from jaxbox.cache import CacheWarning
 from jaxbox.io import InputError
+from jaxbox.run.cache import CacheWarning
 
 FILE_WIDTH = 120
 """Columns of a table where stdout is no terminal: wide enough for all of them."""

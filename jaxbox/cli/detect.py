@@ -23,7 +23,8 @@ from jaxbox.cli.report import (
 from jaxbox.cli.results import RUN_NAME, ResultFormat, Results, RunAccount, written
 from jaxbox.config import DetectorConfig
 from jaxbox.io.jsonl import JSONL
-from jaxbox.workers import WorkerDied
+from jaxbox.run.processes import WorkerDied
+from jaxbox.run.summary import summarise
 
 PICTURE_FOLDER = "pictures"
 
@@ -258,7 +259,7 @@ def _write(
             image=frame.image,
         )
     if options.json:
-        health = frame.detections.summary(options.config).to_dict()
+        health = summarise(frame.detections, options.config).to_dict()
         timing = {"num_points": frame.num_points, "detect_ms": round(frame.detect_s * 1e3, 3)}
         _print_json({**record, **timing, "health": health})
     run.add_compile_times(frame.compile_s)

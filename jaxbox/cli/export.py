@@ -8,7 +8,7 @@ import jax
 from rich.console import Console
 
 from jaxbox.config import DetectorConfig
-from jaxbox.export import export_detector, write_exported
+from jaxbox.run.export import export_detector, write_exported
 
 
 class Platform(enum.StrEnum):

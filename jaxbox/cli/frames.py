@@ -13,11 +13,11 @@ from jaxbox import io
 from jaxbox.cli.timing import TimedDetector
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation.iou import image_fractions
+from jaxbox.geometry.projection import project_boxes
 from jaxbox.io.points import Points
-from jaxbox.projection import project_boxes
+from jaxbox.run.processes import ProcessPool, ahead
 from jaxbox.types import Calibration, Detections, PointCloud
 from jaxbox.viz import BoxSet, draw_stages, save_png
-from jaxbox.workers import ProcessPool, ahead
 
 SHOWN_PICTURES = ("boxes", "lidar", "image")
 """Of the pictures of the stages, those that show the answer."""

@@ -7,11 +7,11 @@ import jax
 from rich.console import Console
 from rich.table import Table
 
-from jaxbox.cache import CACHE_VARIABLE, CacheFolders
+from jaxbox._padding import CAPACITY_BUCKETS
 from jaxbox.config import DetectorConfig
-from jaxbox.padding import CAPACITY_BUCKETS
-from jaxbox.shipping import shipped_state
-from jaxbox.versions import versions
+from jaxbox.run.cache import CACHE_VARIABLE, CacheFolders
+from jaxbox.run.shipping import shipped_state
+from jaxbox.run.versions import versions
 
 
 def print_info(console: Console, *, as_json: bool = False) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from jaxbox import io
-from jaxbox.mounting import Mounting
+from jaxbox.geometry.mounting import Mounting
 
 
 def seen_from_sensor(

@@ -7,7 +7,7 @@ import numpy as np
 from rich.table import Table
 
 from jaxbox.config import DEFAULT_CUT
-from jaxbox.summary import classes_in_words
+from jaxbox.run.summary import classes_in_words
 from jaxbox.types import Detections, Status
 
 SHOWN_MIN_SCORE = DEFAULT_CUT

@@ -14,16 +14,16 @@ import numpy as np
 from jaxbox import io
 from jaxbox.cli.console import OutputError
 from jaxbox.config import DetectorConfig
+from jaxbox.config.fields import differing_names, recorded_options
+from jaxbox.geometry.mounting import Mounting
 from jaxbox.io.jsonl import JSONL
 from jaxbox.io.mcap_results import MCAP_RESULTS
 from jaxbox.io.parquet import PARQUET
 from jaxbox.io.points import Points
 from jaxbox.io.rerun import RERUN
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
-from jaxbox.mounting import Mounting
-from jaxbox.settings import differing_names, recorded_options
+from jaxbox.run.versions import versions
 from jaxbox.types import Calibration, Detections
-from jaxbox.versions import versions
 
 CONFIG_NAME = "config.toml"
 """The exact settings, beside the results."""

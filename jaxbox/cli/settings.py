@@ -4,9 +4,9 @@ import pathlib
 from collections.abc import Sequence
 
 from jaxbox.config import DetectorConfig
+from jaxbox.config.fields import all_settings, base_of, parse_change, preset_settings, replace_settings
 from jaxbox.io import InputError, read_config
 from jaxbox.io.config import read_preset
-from jaxbox.settings import all_settings, base_of, parse_change, preset_settings, replace_settings
 from jaxbox.steps import check_settings
 
 

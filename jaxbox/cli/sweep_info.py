@@ -8,12 +8,12 @@ import numpy as np
 from rich.console import Console
 
 from jaxbox import io
-from jaxbox.config import DetectorConfig
+from jaxbox._padding import fitting_capacity
+from jaxbox.config import DetectorConfig, propose_capacities
+from jaxbox.config.fields import changed_settings
+from jaxbox.config.sensors import TUNED_BEAMS, fitting_sensor
 from jaxbox.evaluation.beams import beam_of_points, goes_beam_by_beam
-from jaxbox.mounting import MIN_SENSOR_HEIGHT_M, Mounting, measure_mounting
-from jaxbox.padding import fitting_capacity
-from jaxbox.sensors import TUNED_BEAMS, fitting_sensor
-from jaxbox.settings import changed_settings
+from jaxbox.geometry.mounting import MIN_SENSOR_HEIGHT_M, Mounting, measure_mounting
 from jaxbox.types import GROUND_ABOVE_M
 
 NUM_BEAMS = (16, 32, 40, 64, 80, 128)
@@ -157,13 +157,13 @@ def _peaks(elevation_deg: np.ndarray) -> np.ndarray:
 
 
 def fitting_beams(infos: Sequence[SweepInfo]) -> int:
-    """The sensor of `jaxbox.sensors` that sees as these sweeps' does; 64 beams where that cannot be told.
+    """The sensor of `jaxbox.config.sensors` that sees as these sweeps' does; 64 beams where that is unknown.
 
     Args:
       infos: of sweeps of one sensor.
 
     Returns:
-      One of `jaxbox.sensors.SENSORS`.
+      One of `jaxbox.config.sensors.SENSORS`.
     """
     spacings = [info.spacing_deg for info in infos if info.spacing_deg is not None]
     return fitting_sensor(float(np.median(spacings))) if spacings else TUNED_BEAMS
@@ -188,8 +188,8 @@ def fitting_settings(
         "box.max_slab_points": base.box.max_slab_points or capacity // 4,
     }
     usual |= {f"clustering.maps.{i}.max_cells": m.max_cells for i, m in enumerate(base.clustering.maps)}
-    needed = changed_settings(DetectorConfig.for_sweeps(sweeps, base=base, margin=1), base)
-    proposed = changed_settings(DetectorConfig.for_sweeps(sweeps, base=base), base)
+    needed = changed_settings(propose_capacities(sweeps, base=base, margin=1), base)
+    proposed = changed_settings(propose_capacities(sweeps, base=base), base)
     return {name: proposed[name] for name, value in needed.items() if value > usual[name]}
 
 

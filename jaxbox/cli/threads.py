@@ -2,7 +2,7 @@
 
 import os
 
-from jaxbox.workers import THREADS_VARIABLE
+from jaxbox.run.processes import THREADS_VARIABLE
 
 
 def compute_on_one_thread() -> None:

@@ -16,16 +16,16 @@ from typing import Any
 import jax
 
 from jaxbox import io
-from jaxbox.cache import CacheFolders
 from jaxbox.cluster.reports import DatasetReport, PartitionReport
 from jaxbox.cluster.sources import SweepRef, list_sweeps
 from jaxbox.cluster.store import Store
 from jaxbox.cluster.worker import REPORT_KEY, SUFFIX, Partition, PartitionWorker, Task, is_attempt
 from jaxbox.config import DetectorConfig
+from jaxbox.config.fields import differing_names, recorded_options, settings_from_toml, settings_to_toml
 from jaxbox.io._extras import require
-from jaxbox.settings import differing_names, recorded_options, settings_from_toml, settings_to_toml
+from jaxbox.run.cache import CacheFolders
+from jaxbox.run.versions import versions
 from jaxbox.steps import check_settings
-from jaxbox.versions import versions
 
 MANIFEST = "manifest.json"
 """The account of a run, beside its partitions."""

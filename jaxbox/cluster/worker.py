@@ -16,17 +16,17 @@ import jax
 import numpy as np
 
 from jaxbox import io
-from jaxbox.batching import detect_batch
-from jaxbox.cache import CacheFolders
 from jaxbox.cluster.reports import PartitionReport
 from jaxbox.cluster.sources import SweepReader, SweepRef
 from jaxbox.cluster.store import Store
 from jaxbox.config import DetectorConfig
 from jaxbox.io.parquet import open_parquet
 from jaxbox.io.results import SweepResult
+from jaxbox.run.batching import detect_batch
+from jaxbox.run.cache import CacheFolders
+from jaxbox.run.processes import THREADS_VARIABLE, ahead
+from jaxbox.run.versions import versions
 from jaxbox.types import Detections, PointCloud
-from jaxbox.versions import versions
-from jaxbox.workers import THREADS_VARIABLE, ahead
 
 if sys.platform == "win32":
     resource = None

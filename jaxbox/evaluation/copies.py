@@ -14,7 +14,7 @@ import numpy as np
 from jaxbox.config import DetectorConfig
 from jaxbox.detector import detect
 from jaxbox.evaluation.matching import count_points_in_boxes
-from jaxbox.geometry import wrap_yaw
+from jaxbox.geometry.planar import wrap_yaw
 from jaxbox.io import KittiObject, Sweep, boxes_from_objects, objects_from_detections
 from jaxbox.types import Calibration, Detections, PointCloud, Status
 

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox import geometry
+from jaxbox.geometry import planar
 
 # Lists of pairs are padded to powers of two from this one on, so that few lengths are ever compiled.
 _MIN_PAIRS = 1024
@@ -25,12 +25,12 @@ def box_overlaps(box_a: jax.Array, box_b: jax.Array) -> tuple[jax.Array, jax.Arr
       The bird's-eye IoU and the 3D IoU, each () in [0, 1], and 0 where a box is empty.
     """
     bev_a, bev_b = _footprint(box_a), _footprint(box_b)
-    area = geometry.rectangle_intersection(bev_a, bev_b)
+    area = planar.rectangle_intersection(bev_a, bev_b)
     top = jnp.minimum(box_a[2] + box_a[5] / 2, box_b[2] + box_b[5] / 2)
     bottom = jnp.maximum(box_a[2] - box_a[5] / 2, box_b[2] - box_b[5] / 2)
     shared = area * jnp.maximum(top - bottom, 0)
     union = jnp.prod(box_a[3:6]) + jnp.prod(box_b[3:6]) - shared
-    return geometry.rectangle_iou(bev_a, bev_b), jnp.where(
+    return planar.rectangle_iou(bev_a, bev_b), jnp.where(
         union > 0, shared / jnp.where(union > 0, union, 1), 0
     )
 

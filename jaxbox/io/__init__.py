@@ -1,6 +1,6 @@
 """Files in and out: points and recordings of every kind, data sets' layouts, labels, images, and results."""
 
-from jaxbox.io._files import InputError, atomic_path, atomic_writer, remove_abandoned
+from jaxbox._files import InputError, atomic_path, atomic_writer, remove_abandoned
 from jaxbox.io.argoverse2 import (
     read_argoverse2_boxes,
     read_argoverse2_ground,

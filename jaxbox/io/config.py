@@ -6,9 +6,9 @@ import pathlib
 import tomllib
 from typing import Any
 
+from jaxbox._files import InputError, atomic_writer, read_text, reason
 from jaxbox.config import DetectorConfig
-from jaxbox.io._files import InputError, atomic_writer, read_text, reason
-from jaxbox.settings import PRESET_KEY, apply_settings, base_of, settings_to_toml, without_base
+from jaxbox.config.fields import PRESET_KEY, apply_settings, base_of, settings_to_toml, without_base
 
 _MAX_BYTES = 2**20
 
@@ -19,7 +19,7 @@ def read_config(
     """Reads a settings file.
 
     Args:
-      path: TOML, or JSON where it is named so: tables and dotted names of `jaxbox.settings`.
+      path: TOML, or JSON where it is named so: tables and dotted names of `jaxbox.config.fields`.
       base: what the file changes; None for the preset that it names under ``preset``, or the default one.
       sensor: number of beams that this is fitted to before, see `DetectorConfig.for_sensor`; None for what
         the file names under ``sensor``, if anything.

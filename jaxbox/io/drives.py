@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterable
 
-from jaxbox.io._files import InputError, read_text
+from jaxbox._files import InputError, read_text
 
 _COMMENT = "#"
 _COLUMNS = 2

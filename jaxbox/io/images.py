@@ -6,7 +6,7 @@ import struct
 import cv2
 import numpy as np
 
-from jaxbox.io._files import InputError, read_bytes
+from jaxbox._files import InputError, read_bytes
 
 MAX_PIXELS = 2**26
 """Ten times those of the finest cameras; OpenCV asks for the memory of what a file claims."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxbox.io._files import InputError, atomic_writer, parse_json, read_text
+from jaxbox._files import InputError, atomic_writer, parse_json, read_text
 from jaxbox.io.results import ResultFile, WriteResult
 from jaxbox.types import Counts, Detections, Label, Status
 

@@ -17,8 +17,8 @@ from collections.abc import Iterable, Sequence
 import jax
 import numpy as np
 
-from jaxbox.io._files import InputError, atomic_writer, finite_number, read_text
-from jaxbox.projection import project_boxes
+from jaxbox._files import InputError, atomic_writer, finite_number, read_text
+from jaxbox.geometry.projection import project_boxes
 from jaxbox.types import Calibration, Detections, Label
 
 # Columns of the object labels, in the order of the development kit's readme.
@@ -345,7 +345,7 @@ def boxes_from_objects(
 
 
 def _wrap_yaw(yaw: np.ndarray) -> np.ndarray:
-    """`jaxbox.geometry.wrap_yaw` in NumPy: under JAX every new number of labels would compile anew."""
+    """`jaxbox.geometry.planar.wrap_yaw` in NumPy: under JAX every new number of labels would compile anew."""
     wrapped = yaw - np.pi * np.floor(yaw / np.pi + 0.5)
     return np.where(wrapped >= np.pi / 2, -np.pi / 2, wrapped)
 

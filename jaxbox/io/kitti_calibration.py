@@ -11,8 +11,8 @@ import pathlib
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox.io._files import InputError, atomic_writer, finite_number, read_text
-from jaxbox.projection import check_full_rank, compose_transforms, rigid_transform
+from jaxbox._files import InputError, atomic_writer, finite_number, read_text
+from jaxbox.geometry.projection import check_full_rank, compose_transforms, rigid_transform
 from jaxbox.types import Calibration
 
 IMAGE_SIZE_PX = (1242, 375)

@@ -7,7 +7,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from jaxbox.io._files import InputError
+from jaxbox._files import InputError
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,10 +7,10 @@ from typing import overload
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox.io._files import InputError
+from jaxbox._files import InputError
+from jaxbox.geometry.mounting import Mounting, measure_mounting
 from jaxbox.io.points import Points
 from jaxbox.io.sweep import Sweep
-from jaxbox.mounting import Mounting, measure_mounting
 from jaxbox.types import Calibration
 
 NUM_MEASURED = 5

@@ -12,7 +12,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from jaxbox.io._files import InputError, check_file, reason
+from jaxbox._files import InputError, check_file, reason
 from jaxbox.io.points import PointFormat, Points, check_num_points, check_unpacked, named_points
 
 ARRAY_NAMES = ("points", "xyz", "pointcloud", "data", "arr_0")

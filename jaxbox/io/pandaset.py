@@ -14,7 +14,7 @@ import os
 
 import numpy as np
 
-from jaxbox.io._files import InputError, read_text
+from jaxbox._files import InputError, read_text
 from jaxbox.io.labelled import LabelledBoxes, finite_number, labelled_boxes
 from jaxbox.io.points import read_bin, seen_from
 

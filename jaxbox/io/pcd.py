@@ -12,8 +12,8 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from jaxbox._files import InputError, check_file, reason
 from jaxbox.io._extras import require
-from jaxbox.io._files import InputError, check_file, reason
 from jaxbox.io.points import (
     PointFormat,
     Points,

@@ -11,7 +11,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from jaxbox.io._files import InputError, check_file, reason
+from jaxbox._files import InputError, check_file, reason
 from jaxbox.io.points import (
     PointFormat,
     Points,

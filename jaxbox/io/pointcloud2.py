@@ -6,7 +6,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from jaxbox.io._files import InputError
+from jaxbox._files import InputError
 from jaxbox.io.points import Points, check_num_bytes, check_num_points, named_points, record_dtype
 
 MESSAGE_TYPES = ("sensor_msgs/msg/PointCloud2", "sensor_msgs/PointCloud2")

@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from jaxbox.io._files import MAX_SWEEP_BYTES, InputError, atomic_path, read_bytes, read_text, reason
+from jaxbox._files import MAX_SWEEP_BYTES, InputError, atomic_path, read_bytes, read_text, reason
 
 _VALUES_PER_POINT = 4
 _BYTES_PER_POINT = _VALUES_PER_POINT * np.dtype("<f4").itemsize

@@ -10,7 +10,7 @@ import pathlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import overload
 
-from jaxbox.io._files import InputError
+from jaxbox._files import InputError
 from jaxbox.io.points import Points
 from jaxbox.io.sweep import Sweep
 

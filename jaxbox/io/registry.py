@@ -6,7 +6,7 @@ Recordings, which hold many sweeps in one file, are listed in `jaxbox.io.sweeps`
 import os
 import pathlib
 
-from jaxbox.io._files import InputError
+from jaxbox._files import InputError
 from jaxbox.io.argoverse2 import FEATHER
 from jaxbox.io.las import LAS
 from jaxbox.io.npy import NPY, NPZ

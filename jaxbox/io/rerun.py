@@ -12,11 +12,11 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxbox._files import atomic_path
+from jaxbox.geometry.projection import project_boxes
 from jaxbox.io._extras import require
-from jaxbox.io._files import atomic_path
 from jaxbox.io.foxglove import COLORS
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
-from jaxbox.projection import project_boxes
 from jaxbox.types import Calibration
 
 _JPEG_QUALITY = 85

@@ -8,7 +8,7 @@ import os
 
 import numpy as np
 
-from jaxbox.io._files import InputError, read_bytes
+from jaxbox._files import InputError, read_bytes
 from jaxbox.io.labelled import check_count
 
 GROUND_CLASSES = frozenset({40, 44, 48, 49, 60, 72})

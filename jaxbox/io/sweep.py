@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxbox.io._files import InputError
+from jaxbox._files import InputError
 from jaxbox.io.images import read_image, read_image_size
 from jaxbox.io.kitti import KittiObject, read_labels
 from jaxbox.io.kitti_calibration import IMAGE_SIZE_PX, read_calibration, read_raw_calibration

@@ -26,7 +26,7 @@ import pathlib
 from collections.abc import Iterator, Sequence
 from typing import overload
 
-from jaxbox.io._files import InputError, check_file, read_text
+from jaxbox._files import InputError, check_file, read_text
 from jaxbox.io.kitti import tracking_name
 from jaxbox.io.kitti_calibration import RAW_CALIBRATION_FILES
 from jaxbox.io.mcap import MCAP

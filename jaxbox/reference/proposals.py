@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from jaxbox.class_priors import ClassPrior
 from jaxbox.config import ComponentMap
+from jaxbox.config.class_priors import ClassPrior
 from jaxbox.reference.boxes import convex_hull, criterion_curve, fit_points
 from jaxbox.reference.clusters import (
     NO_CLUSTER,

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from scipy.special import expit
 
-from jaxbox.class_priors import ClassPrior
+from jaxbox.config.class_priors import ClassPrior
 
 DOUBT_POINTS = 5
 """So many upper points, with the share of full worth behind the faces, are taken for granted."""

@@ -7,16 +7,17 @@ from collections.abc import Sequence
 import jax
 import jax.numpy as jnp
 
-from jaxbox import descriptors, hull, vehicles
 from jaxbox.config import DetectorConfig
-from jaxbox.devices import on_accelerator
-from jaxbox.loops import at_once, fold_rows, map_rows, store
-from jaxbox.masked import compact, count_true, greatest, lookup, take
+from jaxbox.stages import descriptors, hull
+from jaxbox.stages import scoring as vehicles
 from jaxbox.steps.boxes import Fits, max_slab_points, trace_hulls
 from jaxbox.steps.decision import Candidates
 from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals
 from jaxbox.types import GROUND_ABOVE_M, Counts, Descriptors, Detections, Hulls, PointCloud, Status
+from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.loops import at_once, fold_rows, map_rows, store
+from jaxbox.xla.masked import compact, count_true, greatest, lookup, take
 
 OWNER_CHUNK = 4096
 """Points whose detections are looked up at a time."""

@@ -8,15 +8,16 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxbox import box, completion, evidence, hull
 from jaxbox.config import CompletionConfig, DetectorConfig
-from jaxbox.grouping import largest_first, sort_by_group
-from jaxbox.loops import fold_rows, map_rows, store
-from jaxbox.masked import compact, split_index, take
+from jaxbox.stages import completion, evidence, hull
+from jaxbox.stages import rectangles as box
 from jaxbox.steps.common import class_values, stage_options
 from jaxbox.steps.points import Heights, Obstacles, Sweep
 from jaxbox.steps.proposals import Proposals, Trials, list_trials, longest_side
 from jaxbox.types import NOT_A_BOX, Boxes, Label, Rectangles
+from jaxbox.xla.loops import fold_rows, map_rows, store
+from jaxbox.xla.masked import compact, split_index, take
+from jaxbox.xla.sorting import largest_first, sort_by_group
 
 INSISTENCE = 5.0
 """How often the scene's direction counts for the second reading of a cluster: it bends a closeness only."""

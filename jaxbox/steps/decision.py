@@ -7,17 +7,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxbox import evidence, vehicles
 from jaxbox.config import DetectorConfig
-from jaxbox.devices import on_accelerator
-from jaxbox.geometry import wrap_yaw
-from jaxbox.loops import for_chunks, map_rows
-from jaxbox.masked import compact, take
+from jaxbox.geometry.planar import wrap_yaw
+from jaxbox.stages import evidence
+from jaxbox.stages import scoring as vehicles
 from jaxbox.steps.boxes import cast_rays
 from jaxbox.steps.common import class_values, stage_options
 from jaxbox.steps.points import Heights, Obstacles, height_above_ground
 from jaxbox.steps.proposals import Proposals, Trials
 from jaxbox.types import NOT_A_BOX, Boxes
+from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.loops import for_chunks, map_rows
+from jaxbox.xla.masked import compact, take
 
 RANK_STEP = 16
 """Rows that all others are compared with in one step."""

@@ -5,12 +5,12 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from jaxbox import filtering, ground
 from jaxbox.config import DetectorConfig
-from jaxbox.loops import store
-from jaxbox.masked import compact, take
+from jaxbox.stages import filtering, ground
 from jaxbox.steps.common import stage_options
 from jaxbox.types import GroundPlane, PointCloud
+from jaxbox.xla.loops import store
+from jaxbox.xla.masked import compact, take
 
 MAX_ABS_Z_M = 100.0
 """Points farther above or below the sensor are faults: one alone would stretch the spread of the whole

@@ -8,15 +8,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxbox import clustering, selection
-from jaxbox.class_priors import ClassPrior
 from jaxbox.config import DetectorConfig
-from jaxbox.devices import on_accelerator
-from jaxbox.loops import fold_rows, for_chunks, map_rows, store
-from jaxbox.masked import compact, lookup, split_index, take
+from jaxbox.config.class_priors import ClassPrior
+from jaxbox.stages import clustering, selection
 from jaxbox.steps.common import stage_options
 from jaxbox.steps.points import Obstacles
 from jaxbox.types import Clusters, Label, Rectangles
+from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.loops import fold_rows, for_chunks, map_rows, store
+from jaxbox.xla.masked import compact, lookup, split_index, take
 
 CHUNK = 8192
 """Points looked up at a time."""

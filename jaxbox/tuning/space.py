@@ -7,7 +7,7 @@ from collections.abc import Generator, Mapping, Sequence
 import numpy as np
 
 from jaxbox.config import DetectorConfig
-from jaxbox.settings import check_traced, traced_settings
+from jaxbox.config.fields import check_traced, traced_settings
 
 Changes = Mapping[str, float]
 """Thresholds by dotted name that differ from the base."""

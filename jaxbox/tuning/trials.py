@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 import jax
 import numpy as np
 
+from jaxbox._padding import fitting_capacity
 from jaxbox.config import DetectorConfig
+from jaxbox.config.fields import replace_settings
 from jaxbox.detector import detect
 from jaxbox.evaluation.copies import Copy, Frame, detect_copy
 from jaxbox.evaluation.objectives import Matched, Objective
-from jaxbox.padding import fitting_capacity
-from jaxbox.settings import replace_settings
 from jaxbox.tuning.selection import Trial, score_without
 from jaxbox.tuning.space import Changes
 from jaxbox.types import PointCloud, Status

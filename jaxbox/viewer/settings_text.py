@@ -4,7 +4,7 @@ import json
 from typing import Any
 
 from jaxbox.config import DetectorConfig
-from jaxbox.settings import NO_VALUE, PRESET_KEY, changed_settings, settings_to_toml
+from jaxbox.config.fields import NO_VALUE, PRESET_KEY, changed_settings, settings_to_toml
 
 
 def settings_text(config: DetectorConfig, preset: str | None, *, min_score: float) -> str:

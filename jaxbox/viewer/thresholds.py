@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 
 from jaxbox.config import DetectorConfig
-from jaxbox.settings import traced_settings
+from jaxbox.config.fields import traced_settings
 
 
 def _always(_: DetectorConfig) -> bool:

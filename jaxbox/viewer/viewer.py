@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 from jaxbox.config import DetectorConfig
+from jaxbox.config.fields import preset_settings, replace_settings
 from jaxbox.io import InputError
-from jaxbox.settings import preset_settings, replace_settings
 from jaxbox.viewer import words
 from jaxbox.viewer.frames import Frame
 from jaxbox.viewer.scene import Scene, View, build_scene

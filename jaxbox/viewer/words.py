@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from jaxbox.summary import classes_in_words
+from jaxbox.run.summary import classes_in_words
 from jaxbox.types import Detections, Status
 from jaxbox.viewer.frames import Frame
 from jaxbox.viewer.session import Session, Shown

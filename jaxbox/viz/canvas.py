@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from jaxbox.io import atomic_path
+from jaxbox._files import atomic_path
 from jaxbox.viz.colors import BACKGROUND, INK, Color
 
 SHIFT = 4

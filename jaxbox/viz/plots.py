@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jaxbox.io import atomic_path
+from jaxbox._files import atomic_path
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -1,0 +1,443 @@
+"""The detector's settings: one sub-config a stage, and the presets.
+
+A field marked static decides a shape or a loop bound: changing it compiles anew. Every other field
+is compared with data and is traced: a sweep over thresholds is a `jax.vmap` and compiles once.
+Lengths are metres, angles degrees (``_deg``), everything else unitless unless said.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any, Literal, TypeVar, dataclass_transform
+
+import jax
+
+from jaxbox.config.class_priors import CAR, TRUCK, VAN, ClassPrior, Scalar
+from jaxbox.config.sensors import sensor_settings
+
+_T = TypeVar("_T")
+
+
+DEFAULT_CUT = 0.15
+"""Score from which a box is worth acting on: over sweeps whose labels go all round (Argoverse 2, PandaSet,
+SemanticKITTI) more than 9 of 10 such boxes are vehicles, see ``benchmarks/results/sensors.json``."""
+
+
+CAPACITY_STEP = 1024
+"""Proposed capacities are multiples of this, so that proposals from similar sweeps share one compile."""
+
+GROUND_CANDIDATE_CELL_M = 1.0
+"""Edge of the cells whose lowest points are candidates for the ground: wide enough that most of them near by
+see the road."""
+
+
+def _static(default: Any) -> Any:
+    return dataclasses.field(default=default, metadata={"static": True})
+
+
+@dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(_static,))
+def _config(cls: type[_T]) -> type[_T]:
+    return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True, kw_only=True)(cls))
+
+
+@_config
+class RegionConfig:
+    """The part of the world that is looked at; points outside are counted and left out.
+
+    So are points 100 m or more above or below the sensor.
+    """
+
+    half_x_m: float = _static(default=80.0)
+    """static: |x| below this."""
+    half_y_m: float = _static(default=60.0)
+    """static: |y| below this."""
+
+
+@_config
+class FilterConfig:
+    """Statistical filtering by mean shift and standard deviation (paper, 3.1)."""
+
+    enabled: bool = _static(default=True)
+    """static: whether the stage runs."""
+    cell_m: float = _static(default=1.0)
+    """static: edge of the grid's cells, over the region."""
+    num_levels: int = _static(default=8)
+    """static: cells of the grid in height, centred on the sensor; points beyond join the end levels."""
+    num_iterations: int = _static(default=3)
+    """static: mean shift iterations."""
+    bandwidth_m: Scalar = 1.0
+    """Standard deviation of the Gaussian window that weighs the neighbouring cells."""
+    num_std: Scalar = 8.0
+    """t: a point farther from its converged centroid than mean + t standard deviations is an outlier."""
+    min_density: Scalar = 1.1
+    """Points whose window holds a smaller weight are outliers: a point alone in it weighs 1."""
+
+
+@_config
+class GroundConfig:
+    """RANSAC ground removal (Algorithm I), and the ground grid that follows uneven roads."""
+
+    candidates: Literal["cell_minima", "points"] = _static(default="cell_minima")
+    """static: what planes are fitted to: the lowest point of each 1 m cell, or points spread evenly
+    over the sweep (the paper)."""
+    num_candidates: int = _static(default=4096)
+    """static: how many points for ``candidates="points"``."""
+    candidate_half_x_m: float = _static(default=40.0)
+    """static: cell minima are taken where |x| is below this."""
+    candidate_half_y_m: float = _static(default=20.0)
+    """static: cell minima are taken where |y| is below this."""
+    num_hypotheses: int = _static(default=128)
+    """static: R, planes sampled in a round."""
+    max_planes: int = _static(default=1)
+    """static: rounds; each removes the inliers of its plane (Algorithm I, "repeat")."""
+    num_refits: int = _static(default=3)
+    """static: refits of the best plane on all its inliers."""
+    tolerance_m: Scalar = 0.1
+    """A candidate within this of a plane is an inlier."""
+    max_slope_deg: Scalar = 12.0
+    """Steeper planes are no ground."""
+    min_inlier_fraction: Scalar = 0.1
+    """A plane with a smaller share of the candidates is no ground."""
+    surface: bool = _static(default=True)
+    """static: refine the plane by the ground grid; False stops at the planes (the paper)."""
+    surface_cell_m: float = _static(default=0.5)
+    """static: edge of the cells whose lowest points are ground; the ground grid's are twice as wide."""
+    surface_half_m: float = _static(default=80.0)
+    """static: the ground grid covers |x|, |y| below this; beyond it its border value holds."""
+    num_envelope_rounds: int = _static(default=10)
+    """static: cells over which the slope limit spreads."""
+    max_grade: Scalar = 0.07
+    """Steepest rise of the ground relative to the plane, m/m."""
+    band_below_m: Scalar = 0.3
+    """Points lower than the plane by more than this, at the sensor, are no ground."""
+    band_below_grade: Scalar = 0.02
+    """Growth of that band with range, m/m."""
+    band_above_m: Scalar = 0.3
+    """Points higher than the plane by more than this, at the sensor, are no ground."""
+    band_above_grade: Scalar = 0.06
+    """Growth of that band with range, m/m."""
+    blind_radius_m: Scalar = 2.5
+    """Points nearer than this are the carrier vehicle, not ground."""
+    envelope_margin_m: Scalar = 0.1
+    """A cell minimum within this of the lower envelope is ground."""
+    smoothing_m: Scalar = 1.0
+    """Standard deviation of the Gaussian that smooths the ground grid (and fills it, 4 x wider)."""
+    min_height_m: Scalar = 0.2
+    """A point higher above the ground than this is an obstacle; others are ground."""
+    max_height_m: Scalar = 4.5
+    """A point higher above the ground than this is overhead, and left out."""
+
+
+@_config
+class ComponentMap:
+    """One occupancy grid whose connected components propose clusters."""
+
+    cell_m: float = _static(default=0.2)
+    """static: edge of the cells; neighbours (also diagonal ones) are linked."""
+    num_levels: int = _static(default=1)
+    """static: cells in height; 1 is a bird's-eye view map, more is a 3D grid."""
+    max_cells: int = _static(default=8192)
+    """static: capacity for occupied cells, where a run of neighbours along y counts once (on a map with
+    levels, a run in height)."""
+    max_clusters: int = _static(default=512)
+    """static: capacity for clusters that pass the gates."""
+    min_height_m: Scalar = 0.2
+    """Only points higher above the ground than this."""
+    max_height_m: Scalar = 2.6
+    """Only points lower above the ground than this."""
+
+
+@_config
+class ClusteringConfig:
+    """Euclidean clustering on grids (paper, 3.2, Algorithm II).
+
+    Each map of the default preset is only a proposal: a finer map splits what a coarser one merges,
+    and the evidence for the boxes decides.
+    """
+
+    maps: tuple[ComponentMap, ...] = (
+        ComponentMap(cell_m=0.2, max_cells=7168),
+        ComponentMap(cell_m=0.1, max_cells=10240, min_height_m=0.3, max_height_m=2.0),
+        ComponentMap(cell_m=0.5, max_cells=4096),
+    )
+    """The component maps; the first also gives the scene direction and the components for display."""
+    max_obstacles: int | None = _static(default=None)
+    """static: capacity for points above the ground; None is 3/4 of the cloud's capacity."""
+    adaptive_start_m: Scalar = 20.0
+    """Range from which the linking distance grows."""
+    adaptive_growth: Scalar = 0.005
+    """Growth of the linking distance with range beyond the start, per metre; 0 keeps it fixed."""
+    min_points: Scalar = 8.0
+    """Clusters with fewer points are left out."""
+    max_extent_m: Scalar = 12.0
+    """Clusters longer than this along x or y are left out."""
+
+
+@_config
+class EvidenceConfig:
+    """What each beam says about a box: hit, seen through (free) or hidden, on a polar grid."""
+
+    enabled: bool = _static(default=True)
+    """static: whether the evidence is built; without it every box counts as hit."""
+    num_azimuths: int = _static(default=1440)
+    """static: azimuth cells of the polar grid, all round."""
+    num_ranges: int = _static(default=320)
+    """static: range cells of the polar grid."""
+    range_cell_m: float = _static(default=0.25)
+    """static: length of a range cell."""
+    min_range_m: Scalar = 2.0
+    """Nearer returns are the carrier vehicle."""
+    hit_min_height_m: Scalar = 0.3
+    """A return between these heights is a hit."""
+    hit_max_height_m: Scalar = 1.2
+    """See ``hit_min_height_m``."""
+    free_min_height_m: Scalar = 0.35
+    """A beam between these heights shows that the space is free."""
+    free_max_height_m: Scalar = 0.8
+    """See ``free_min_height_m``."""
+    end_gap_m: Scalar = 0.3
+    """A beam that ends between those heights shows free space up to this before its return."""
+    support_height_m: Scalar = 0.15
+    """Points within this of the ground support the ground round a box."""
+
+
+@_config
+class HullConfig:
+    """Convex hull (paper, 3.3)."""
+
+    max_vertices: int = _static(default=40)
+    """static: H, capacity for hull vertices."""
+    num_slices: int = _static(default=32)
+    """static: slices along each axis whose extreme points reach the hull; the hull misses points by
+    at most one slice (the cluster's extent over the number of slices)."""
+
+
+@_config
+class BoxConfig:
+    """Rectangle by trying all rotations (paper, 3.4, Algorithm III)."""
+
+    criterion: Literal["area", "variance", "closeness", "visible_closeness"] = _static(
+        default="visible_closeness"
+    )
+    """static: what the best rotation has: the smallest area (the paper), the smallest variance of the
+    distances to the edges, the points closest to the edges, or to the two edges facing the sensor."""
+    num_angles: int = _static(default=90)
+    """static: A, rotations tried over 90 degrees."""
+    fit_to: Literal["slab", "hull"] = _static(default="slab")
+    """static: fit to points of the cluster between two heights, or to its convex hull (the paper)."""
+    max_points: int = _static(default=128)
+    """static: M, points of a cluster that the rectangle is fitted to, spread evenly over it."""
+    max_slab_points: int | None = _static(default=None)
+    """static: capacity for points between the slab's heights; None is 1/4 of the cloud's capacity."""
+    slab_min_height_m: Scalar = 0.2
+    """Only points higher than this shape the rectangle: below are wheels and kerb."""
+    slab_max_height_m: Scalar = 0.8
+    """Only points lower than this shape the rectangle: above are mirrors and the narrower cabin."""
+    min_slab_points: Scalar = 5.0
+    """Clusters with fewer points between those heights are fitted to all their points."""
+    min_distance_m: Scalar = 0.05
+    """Closeness: points nearer to an edge than this count as on it."""
+    scene_direction: bool = _static(default=True)
+    """static: prefer the direction that most boxes of the sweep share; needs the evidence."""
+    direction_weight: Scalar = 0.2
+    """Height of that preference, in closeness."""
+    direction_sigma_deg: Scalar = 3.0
+    """Width of the vote and of the preference: exp(-(d / sigma)^2)."""
+    direction_min_extent_m: Scalar = 2.2
+    """Boxes with a shorter longest extent do not vote."""
+    direction_max_free: Scalar = 0.15
+    """Boxes with a larger part of their area seen to be free do not vote."""
+
+
+@_config
+class CompletionConfig:
+    """Correction for occluded vehicles: sides out of sight are completed by the class prior."""
+
+    mode: Literal["none", "away", "evidence"] = _static(default="evidence")
+    """static: keep the rectangle as measured (the paper); extend its hidden sides away from the
+    sensor; or let the evidence choose among hypotheses."""
+    along_scene: bool = _static(default=True)
+    """static: let the evidence also judge the rectangle along the scene's direction, where that is not
+    the best rotation by itself; needs ``box.scene_direction``."""
+    seen_length: Scalar = 0.72
+    """A side measured at least so long, as a fraction of the class's length, may be seen whole."""
+    seen_width: Scalar = 0.83
+    """As ``seen_length``, for the width."""
+    seen_weight: Scalar = 0.8
+    """What the measured size of such a side weighs against the class's; hidden sides have the class's."""
+    length_margin_m: Scalar = 0.35
+    """Lengths read short by this: bumpers are round, and the far one is seen last."""
+    width_margin_m: Scalar = 0.06
+    """Widths read short by this."""
+    max_assignments: int = _static(default=4096)
+    """static: capacity for sides of rectangles that the evidence weighs as the length of a class."""
+    num_rays: int = _static(default=32)
+    """static: rays over the box when hypotheses are compared."""
+    num_final_rays: int = _static(default=48)
+    """static: rays over the box for its score."""
+    free_weight: Scalar = 1.0
+    """Cost of the fraction of rays that pass through."""
+    free_length_weight: Scalar = 2.0
+    """Cost of the fraction of the box's area seen to be free."""
+    inside_weight: Scalar = 1.0
+    """Worth of the fraction of fitted points inside the box."""
+    near_weight: Scalar = 0.5
+    """Worth of the mean closeness of fitted points to the visible faces."""
+    closeness_weight: Scalar = 1.0
+    """Worth of the rectangle criterion."""
+    not_away_cost: Scalar = 0.02
+    """Cost of a width that does not extend away from the sensor."""
+
+
+@_config
+class VehicleConfig:
+    """Vehicle decision: gates, score and suppression."""
+
+    surroundings: bool = _static(default=True)
+    """static: judge a box, and measure its height, by all points in and round it; False keeps the height of
+    the cluster, and lets nothing round the box count (the paper)."""
+    classes: tuple[ClassPrior, ClassPrior, ClassPrior] = (CAR, VAN, TRUCK)
+    """Priors of car, van and truck."""
+    large_height_m: Scalar = 1.7
+    """Clusters higher than this are also tried as a van or a truck."""
+    large_min_points: Scalar = 20.0
+    """Clusters with fewer points are not: there would be too little to tell a van from a bush."""
+    large_clearance_m: Scalar = 0.8
+    """Clusters that begin higher than this above the ground are not: they are trees, say."""
+    max_large: int = _static(default=768)
+    """static: capacity for clusters also tried as a van or a truck."""
+    max_candidates: int = _static(default=1024)
+    """static: capacity for boxes that pass the gates, before suppression."""
+    max_detections: int = _static(default=128)
+    """static: K, capacity for boxes in the answer."""
+    margin_m: Scalar = 0.1
+    """A point this far outside a box still counts as inside."""
+    ring_m: Scalar = 0.5
+    """A point farther outside than the margin but nearer than this speaks against the box."""
+    stray_share: Scalar = 0.01
+    """Share of the points in a box that may lie above its top: a single return in the air is no roof."""
+    top_margin_m: Scalar = 0.03
+    """Added to the top of the points: beams seldom meet the very top."""
+    top_grade: Scalar = 0.0075
+    """A top may be higher than that of its points by this times the range: the beams' spacing."""
+    min_extent_m: Scalar = 1.0
+    """Boxes with no measured extent as long as this, and clusters with such a diagonal, are no vehicle."""
+    saturation_points: Scalar = 100.0
+    """Clusters with at least so many points lose no score for sparseness."""
+    sparseness_power: Scalar = 0.3
+    """score x min(1, points / saturation)^power."""
+    free_scale: Scalar = 0.15
+    """score x exp(-(free length of the rays inside / scale)^2), beside x the fraction of rays that hit."""
+    ring_weight: Scalar = 8.0
+    """score x exp(-weight x ring points / points)."""
+    overhead_weight: Scalar = 6.0
+    """score x exp(-weight x points above / points)."""
+    upper_height_m: Scalar = 0.9
+    """Points higher than this are glass, bonnet and roof; see ``ClassPrior.recess_m``."""
+    recess_share: Scalar = 0.4
+    """Full worth from this share of the upper points behind the faces on."""
+    upright_worth: Scalar = 0.2
+    """Worth of a box whose upper points are all on its faces: score x a factor from this to 1."""
+    support_points: Scalar = 10.0
+    """score x min(1, ground points round the box / this)."""
+    objective_gate: Scalar = 2.4
+    """score / (1 + exp(-(J - gate) / softness)), J the objective of the completion."""
+    objective_softness: Scalar = 0.1
+    """See ``objective_gate``."""
+    min_score: Scalar = 1e-4
+    """Boxes that score less are left out. Where you act, cut at `DEFAULT_CUT`."""
+    max_overlap: Scalar = 0.1
+    """Of two boxes with a larger bird's-eye view IoU, the lower-scoring is suppressed."""
+
+
+@_config
+class DetectorConfig:
+    """All settings of `jaxbox.detect`.
+
+    >>> DetectorConfig.paper().box.criterion
+    'area'
+    """
+
+    region: RegionConfig = RegionConfig()
+    filtering: FilterConfig = FilterConfig()
+    ground: GroundConfig = GroundConfig()
+    clustering: ClusteringConfig = ClusteringConfig()
+    evidence: EvidenceConfig = EvidenceConfig()
+    hull: HullConfig = HullConfig()
+    box: BoxConfig = BoxConfig()
+    completion: CompletionConfig = CompletionConfig()
+    vehicles: VehicleConfig = VehicleConfig()
+
+    @classmethod
+    def paper(cls) -> "DetectorConfig":
+        """The paper's own choices: one plane, fixed tolerance, smallest area, no completion."""
+        return cls(
+            ground=GroundConfig(candidates="points", surface=False, tolerance_m=0.2),
+            clustering=ClusteringConfig(
+                maps=(ComponentMap(cell_m=0.35, num_levels=13, max_cells=14336, max_height_m=4.5),),
+                adaptive_growth=0.0,
+            ),
+            evidence=EvidenceConfig(enabled=False),
+            box=BoxConfig(criterion="area", fit_to="hull", scene_direction=False),
+            completion=CompletionConfig(mode="none"),
+            vehicles=VehicleConfig(surroundings=False),
+        )
+
+    @classmethod
+    def fast(cls) -> "DetectorConfig":
+        """Two maps instead of three, and one reading of each cluster: less time, a little less accuracy."""
+        base = cls()
+        fine = ComponentMap(cell_m=0.13, max_cells=9216)
+        return dataclasses.replace(
+            base,
+            clustering=dataclasses.replace(base.clustering, maps=(fine, base.clustering.maps[2])),
+            completion=dataclasses.replace(base.completion, along_scene=False),
+        )
+
+    @classmethod
+    def presets(cls, *, num_beams: int = 64) -> dict[str, "DetectorConfig"]:
+        """The named presets that the command line offers, for a sensor of so many beams."""
+        presets = {"default": cls(), "fast": cls.fast(), "paper": cls.paper()}
+        return {name: cls.for_sensor(num_beams, base=preset) for name, preset in presets.items()}
+
+    @classmethod
+    def for_sensor(cls, num_beams: int, *, base: "DetectorConfig | None" = None) -> "DetectorConfig":
+        """A preset for a sensor of fewer or more beams than the 64 that it was chosen on.
+
+        Which settings depend on the beams, and how their values were measured, is in
+        `jaxbox.config.sensors`. They replace those of the base; all others, and with 64 beams all, stay.
+
+        Args:
+          num_beams: 16, 32, 64 or 128; `jaxbox info FILE` says which of them sees like another sensor.
+          base: where all else comes from; None for the default preset.
+
+        Returns:
+          The settings. The maps' max_cells are static and differ, so each sensor is a compile.
+
+        Raises:
+          ValueError: for another number of beams.
+
+        >>> DetectorConfig.for_sensor(64) == DetectorConfig()
+        True
+        """
+        base = cls() if base is None else base
+        sensor = sensor_settings(num_beams)
+        stages = {
+            stage: dataclasses.replace(getattr(base, stage), **values)
+            for stage, values in sensor.changes.items()
+        }
+        config = dataclasses.replace(base, **stages)
+        cells = [rounded_up(sensor.cells * m.max_cells) for m in config.clustering.maps]
+        return config if sensor.cells == 1 else with_max_cells(config, cells)
+
+
+def rounded_up(size: float) -> int:
+    """The least multiple of `CAPACITY_STEP` that is no smaller."""
+    return CAPACITY_STEP * math.ceil(size / CAPACITY_STEP)
+
+
+def with_max_cells(config: DetectorConfig, cells: Sequence[int]) -> DetectorConfig:
+    """The maps with other capacities for their occupied cells."""
+    maps = zip(config.clustering.maps, cells, strict=True)
+    maps = tuple(dataclasses.replace(m, max_cells=size) for m, size in maps)
+    return dataclasses.replace(config, clustering=dataclasses.replace(config.clustering, maps=maps))

@@ -1,0 +1,1 @@
+"""Plane geometry, projection into a camera's image, and how a sensor is mounted."""

@@ -1,0 +1,153 @@
+"""Traced and compiled programs kept between runs, so that only the first run waits for the compiler."""
+
+import dataclasses
+import os
+import pathlib
+import stat
+import warnings
+from collections.abc import Mapping
+
+import jax
+from jax.experimental.compilation_cache import compilation_cache
+
+from jaxbox import detector
+from jaxbox.run.programs import KeptPrograms
+
+CACHE_VARIABLE = "JAXBOX_CACHE_DIR"
+"""Environment variable that names another folder, or, when empty, switches the cache off."""
+
+PROGRAMS = "programs"
+"""Folder of the traced programs within that of the cache."""
+
+_PRIVATE = 0o700
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+_ROOT = 0
+_chosen_here: set[str] = set()
+"""Folders that JAX's cache was given by `keep_compiled`, and not by the user."""
+
+
+class CacheWarning(UserWarning):
+    """Why nothing is kept."""
+
+
+def enable_cache(folder: str | os.PathLike[str] | None = None) -> pathlib.Path | None:
+    """Keeps what is compiled between processes, so that only the first one waits for the compiler.
+
+    From then on `detect` reads its traced program, which may have come with the installation, instead of
+    tracing it, and compiles its two halves side by side, or loads them from JAX's compilation cache. The
+    answers are the same, bit for bit. Under `jax.jit`, `jax.vmap` and the like it is traced as ever.
+
+    Whoever can write to the folder can run code as you: one that belongs to another user, or that others may
+    write to, is refused with a `CacheWarning`. JAX's compilation cache stays where it is if you have set it
+    up before.
+
+    Args:
+      folder: made where it is missing, for you alone; None for ``JAXBOX_CACHE_DIR``, else ``jaxbox`` within
+        ``XDG_CACHE_HOME``, else ``~/.cache/jaxbox``.
+
+    Returns:
+      The folder; None where none is used: ``JAXBOX_CACHE_DIR`` is empty, which leaves the cache off, or the
+      folder was refused.
+
+    >>> enable_cache()  # doctest: +SKIP
+    PosixPath('/home/ada/.cache/jaxbox')
+    """
+    chosen = cache_folder(os.environ) if folder is None else pathlib.Path(folder)
+    if chosen is None:
+        return None
+    problem = make_private(chosen) or make_private(chosen / PROGRAMS)
+    if problem:
+        warnings.warn(f"{problem} Nothing is kept between runs.", CacheWarning, stacklevel=2)
+    kept = None if problem else chosen
+    if kept is not None:
+        keep_compiled(kept)
+    detector.use_programs(KeptPrograms(None if kept is None else kept / PROGRAMS))
+    return kept
+
+
+def cache_folder(environment: Mapping[str, str]) -> pathlib.Path | None:
+    """Where programs are kept unless a folder is named; None where the cache is switched off.
+
+    Args:
+      environment: the environment variables.
+
+    Returns:
+      ``JAXBOX_CACHE_DIR``, else ``jaxbox`` within ``XDG_CACHE_HOME``, else ``~/.cache/jaxbox``.
+
+    >>> cache_folder({"JAXBOX_CACHE_DIR": ""}) is None
+    True
+    """
+    chosen = environment.get(CACHE_VARIABLE)
+    if chosen is not None:
+        return pathlib.Path(chosen) if chosen else None
+    root = environment.get("XDG_CACHE_HOME")
+    return (pathlib.Path(root) if root else pathlib.Path.home() / ".cache") / "jaxbox"
+
+
+def make_private(folder: pathlib.Path) -> str | None:
+    """Makes a folder for its owner alone, or looks at one that is there.
+
+    Args:
+      folder: of programs that will be run.
+
+    Returns:
+      Why it must not be used, as a sentence; None where it may.
+    """
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(mode=_PRIVATE, exist_ok=True)
+        status = folder.stat()
+    except OSError as error:
+        return f"{error.filename}: {error.strerror}; set {CACHE_VARIABLE} to another folder."
+    if not hasattr(os, "getuid"):
+        return None  # a system without owners and modes of files
+    # Root can do as it likes anyway.
+    if status.st_uid not in (os.getuid(), _ROOT):
+        return f"{folder} belongs to another user, who could run code as you; set {CACHE_VARIABLE}."
+    if status.st_mode & _OTHERS_WRITE:
+        return f"Others may write to {folder} and so run code as you; empty it, then run chmod 700 on it."
+    return None
+
+
+def keep_compiled(folder: pathlib.Path) -> None:
+    """Switches JAX's compilation cache on, unless the user has set it up already.
+
+    Args:
+      folder: where it is to be.
+    """
+    if jax.config.values["jax_compilation_cache_dir"] in (None, *_chosen_here):
+        jax.config.update("jax_compilation_cache_dir", str(folder))
+        _chosen_here.add(str(folder))
+        # What JAX compiled before has settled for it that there is no cache.
+        compilation_cache.reset_cache()
+
+
+@dataclasses.dataclass(frozen=True)
+class CacheFolders:
+    """The caches of a process, for those that it starts."""
+
+    compiled: str | None
+    """Of JAX's compilation cache; None where it is off."""
+    is_enabled: bool
+    """Whether `enable_cache` was called."""
+    programs: str | None
+    """Of traced programs; None where none are kept."""
+
+    @classmethod
+    def of_this_process(cls) -> "CacheFolders":
+        """As they are now."""
+        programs = detector.kept_programs()
+        folder = programs.folder if isinstance(programs, KeptPrograms) else None
+        return cls(
+            compiled=jax.config.values["jax_compilation_cache_dir"],
+            is_enabled=programs is not None,
+            programs=None if folder is None else str(folder),
+        )
+
+    def apply(self) -> None:
+        """Makes them those of this process, before anything is compiled in it."""
+        jax.config.update("jax_compilation_cache_dir", self.compiled)
+        if self.is_enabled:
+            folder = None if self.programs is None else pathlib.Path(self.programs)
+            is_refused = folder is None or make_private(folder) is not None
+            detector.use_programs(KeptPrograms(None if is_refused else folder))

@@ -1,0 +1,76 @@
+"""Shape descriptors: moment of inertia, eccentricity, density, complexity (paper, 3.5 and 4.4)."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxbox.types import Descriptors
+from jaxbox.xla.loops import fold_rows
+from jaxbox.xla.masked import take
+
+MIN_VARIANCE = 1e-6
+"""m^2: points on a line have a minor axis of a millimetre rather than none."""
+
+
+def point_moments(
+    slot: jax.Array, row: jax.Array, num_rows: jax.Array, xy: jax.Array, origin: jax.Array
+) -> jax.Array:
+    """Sums over the points of each cluster, from which their shape follows.
+
+    Args:
+      slot: (L,) int32 cluster of each point of a list, K for none.
+      row: (L,) int32 rows of those points.
+      num_rows: () int32; only the first so many of the list count.
+      xy: (N, 2) float32, m.
+      origin: (K, 2) float32, m, a point near each cluster: moments about it do not cancel.
+
+    Returns:
+      (K, 6) float32: the sums of 1, x, y, x^2, y^2 and x y, about the origin.
+    """
+    size = origin.shape[0]
+
+    def add(total: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
+        slot, row = rows
+        d = take(xy, row) - take(origin, slot)
+        x, y = d[:, :1], d[:, 1:]
+        values = jnp.concatenate([jnp.ones_like(x), x, y, x * x, y * y, x * y], axis=1)
+        return total.at[slot].add(values, mode="drop")
+
+    absent = size, xy.shape[0]
+    return fold_rows(add, jnp.zeros((size, 6), jnp.float32), (slot, row), num_rows=num_rows, absent=absent)
+
+
+def shape_descriptors(moments: jax.Array, hull_area: jax.Array, num_vertices: jax.Array) -> Descriptors:
+    """Describes the shape of each cluster, seen from above.
+
+    With l1 >= l2 the eigenvalues of the covariance of the points, which are their moments of inertia per
+    point about the minor and the major axis: eccentricity = sqrt(l1 / l2), the ratio of the axes' lengths;
+    density = points / hull area; complexity kappa = hull vertices / points (equation 7).
+
+    Args:
+      moments: (K, 6) float32, see `point_moments`.
+      hull_area: (K,) float32, m^2.
+      num_vertices: (K,) int32.
+
+    Returns:
+      The descriptors; 1 for the eccentricity, and 0 else, of an empty cluster.
+
+    Reference: paper, sections 3.5 and 4.4; oracle `jaxbox.reference.shape_descriptors`.
+    """
+    count = moments[:, 0]
+    x, y, xx, yy, xy = (moments[:, 1:] / jnp.maximum(count, 1)[:, None]).T
+    major, minor = _eigenvalues(xx - x * x, yy - y * y, xy - x * y)
+    present = count > 0
+    ratio = jnp.maximum(major, MIN_VARIANCE) / jnp.maximum(minor, MIN_VARIANCE)
+    has_area = present & (hull_area > 0)
+    return Descriptors(
+        moment_of_inertia=jnp.stack([major, minor], axis=1),
+        eccentricity=jnp.sqrt(ratio),
+        density=jnp.where(has_area, count / jnp.where(has_area, hull_area, 1), 0),
+        complexity=jnp.where(present, num_vertices.astype(jnp.float32) / jnp.maximum(count, 1), 0),
+    )
+
+
+def _eigenvalues(a: jax.Array, b: jax.Array, c: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Eigenvalues of the symmetric matrices [[a, c], [c, b]], larger first, not negative."""
+    middle, radius = (a + b) / 2, jnp.hypot((a - b) / 2, c)
+    return jnp.maximum(middle + radius, 0), jnp.maximum(middle - radius, 0)

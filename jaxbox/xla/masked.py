@@ -1,0 +1,335 @@
+"""The fixed-shape toolbox: compaction, prefix sums, counts, masked statistics.
+
+Every function keeps static shapes. A row that is absent is marked by the sentinel index N, one past
+the last; `take` reads zeros there and scatters with ``mode="drop"`` ignore it.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.loops import for_chunks
+
+BLOCK = 512
+"""Columns of sums in two levels."""
+
+UNROLL = 4, 3, 2, 1
+"""Numbers taken in one turn of a loop over them, the most that leave no remainder, which would take kernels
+of its own. Four are twice as fast as one."""
+
+WORD_BITS = 32
+"""Bits of a word of a set of flags."""
+
+
+def prefix_sum(values: jax.Array) -> jax.Array:
+    """Inclusive prefix sum of a vector of integers.
+
+    Args:
+      values: (N,) bool or int32.
+
+    Returns:
+      (N,) int32.
+
+    >>> prefix_sum(jnp.array([1, 0, 2])).tolist()
+    [1, 1, 3]
+    """
+    return _sum_in_blocks(values) if on_accelerator() else _scan_one_by_one(jnp.add, values)
+
+
+def prefix_max(values: jax.Array) -> jax.Array:
+    """The greatest up to each number of a vector of integers.
+
+    Args:
+      values: (N,) int32, not negative.
+
+    Returns:
+      (N,) int32.
+
+    >>> prefix_max(jnp.array([1, 0, 2])).tolist()
+    [1, 1, 2]
+    """
+    return jax.lax.cummax(values) if on_accelerator() else _scan_one_by_one(jnp.maximum, values)
+
+
+def _scan_one_by_one(combine: Callable[..., jax.Array], values: jax.Array) -> jax.Array:
+    def step(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        total, totals = state
+        total = combine(total, values[i].astype(jnp.int32))
+        return total, totals.at[i].set(total, mode="promise_in_bounds")
+
+    size = values.shape[0]
+    return _one_by_one(size, step, (jnp.int32(0), jnp.zeros(size, jnp.int32)))[1]
+
+
+def _one_by_one(
+    size: int,
+    step: Callable[[jax.Array, Any], Any],
+    state: Any,
+    *,
+    rows: int = 1,
+    num: jax.Array | None = None,
+) -> Any:
+    """Calls a step with each index, () uint32, and the state: XLA compiles so small a loop to native code.
+
+    Of several rows one after the other, and no farther than the first `num` of each, or little more.
+    """
+    unroll = next(k for k in UNROLL if size % k == 0)
+    in_use = jnp.uint32(size if num is None else (jnp.minimum(num, size) + unroll - 1) // unroll * unroll)
+
+    def steps(start: jax.Array, state: Any) -> Any:
+        rows_before = sum((start >= row * in_use).astype(jnp.uint32) for row in range(1, rows))
+        first = start + rows_before * (size - in_use)
+        for k in range(unroll):
+            state = step(first + k, state)
+        return state
+
+    return for_chunks(rows * in_use, unroll, steps, state)
+
+
+def count(mask: jax.Array) -> jax.Array:
+    """How many entries of a short mask are True; see `count_true` for long ones.
+
+    Args:
+      mask: (N,) bool, some thousand at most: a CPU takes them one by one, in one kernel instead of three.
+
+    Returns:
+      () int32.
+
+    >>> int(count(jnp.array([True, False, True])))
+    2
+    """
+    if on_accelerator():
+        return jnp.sum(mask, dtype=jnp.int32)
+    return _fold_one_by_one(jnp.add, 0, mask.astype(jnp.int32))
+
+
+def greatest(values: jax.Array, initial: float) -> jax.Array:
+    """The greatest of a short vector of numbers, see `count`.
+
+    Args:
+      values: (N,) int32 or float32, no NaN.
+      initial: static, no number is less.
+
+    Returns:
+      () of the type of the values.
+
+    >>> int(greatest(jnp.array([1, 3, 2]), 0))
+    3
+    """
+    if on_accelerator():
+        return jnp.max(values, initial=initial)
+    return _fold_one_by_one(jnp.maximum, initial, values)
+
+
+def _fold_one_by_one(combine: Callable[..., jax.Array], initial: float, values: jax.Array) -> jax.Array:
+    init = jnp.asarray(initial, values.dtype)
+    return _one_by_one(values.shape[0], lambda i, state: combine(state, values[i]), init)
+
+
+def _sum_in_blocks(values: jax.Array) -> jax.Array:
+    size = values.shape[0]
+    if values.dtype == bool and size > BLOCK:
+        return _count_before(values)
+    blocks = jnp.pad(values.astype(jnp.int32), (0, -size % BLOCK)).reshape(-1, BLOCK)
+    inside = jnp.cumsum(blocks, axis=1)
+    before = jnp.cumsum(inside[:, -1]) - inside[:, -1]
+    return (inside + before[:, None]).reshape(-1)[:size]
+
+
+def _count_before(mask: jax.Array) -> jax.Array:
+    """(N,) prefix sum of truth values, as the bits of words: a sum over words, and bits counted in one."""
+    size = mask.shape[0]
+    bit = jnp.arange(WORD_BITS, dtype=jnp.uint32)
+    words = _words(mask)
+    population = jax.lax.population_count(words).astype(jnp.int32)
+    before = _sum_in_blocks(population) - population
+    up_to = (jnp.uint32(2) << bit) - 1
+    inside = jax.lax.population_count(words[:, None] & up_to[None]).astype(jnp.int32)
+    return (before[:, None] + inside).reshape(-1)[:size]
+
+
+def compact(mask: jax.Array, capacity: int, *, num: jax.Array | None = None) -> tuple[jax.Array, jax.Array]:
+    """Indices of the True entries, in order, at a fixed capacity.
+
+    Args:
+      mask: (N,) bool, or (M, N), whose rows are gone through one after the other.
+      capacity: static; entries beyond it are left out.
+      num: () int32: no entry of a row is True beyond the first so many, of which there may be more than N.
+        A CPU does not look at them.
+
+    Returns:
+      index: (capacity,) int32, ascending, into all M N entries; M N where there is no entry.
+      count: () int32, the true number of entries, which may exceed the capacity.
+
+    >>> compact(jnp.array([False, True, True]), 4)[0].tolist()
+    [1, 2, 3, 3]
+    """
+    if on_accelerator():
+        return _compact_at_once(mask.reshape(-1), capacity)
+    every = jnp.int32(mask.shape[-1])
+    return _compact_one_by_one(jnp.atleast_2d(mask), every if num is None else num, capacity)
+
+
+def _compact_at_once(mask: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
+    order = prefix_sum(mask)
+    target = jnp.where(mask, order - 1, capacity)
+    index = jnp.full(capacity, mask.size, jnp.int32)
+    index = index.at[target].set(jnp.arange(mask.size, dtype=jnp.int32), mode="drop")
+    return index, order[-1]
+
+
+def _compact_one_by_one(mask: jax.Array, num: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
+    """Each index is written, and the next one over it unless it counts."""
+    rows, size = mask.shape
+    flags = mask.reshape(-1)
+
+    def step(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        index, count = state
+        # Beyond the capacity the place is moved back, to the room at the end.
+        index = jax.lax.dynamic_update_slice(index, i.astype(jnp.int32)[None], (count,))
+        return index, count + flags[i].astype(jnp.uint32)
+
+    none = jnp.full(capacity + 1, mask.size, jnp.int32)
+    index, count = _one_by_one(size, step, (none, jnp.uint32(0)), rows=rows, num=num)
+    # Over what the last index wrote if it does not count.
+    index = jax.lax.dynamic_update_slice(index, none[:1], (count,))
+    return index[:capacity], count.astype(jnp.int32)
+
+
+def _words(mask: jax.Array) -> jax.Array:
+    """(W,) uint32: the flags as the bits of words."""
+    bits = jnp.pad(mask, (0, -mask.shape[0] % WORD_BITS)).reshape(-1, WORD_BITS)
+    bit = jnp.arange(WORD_BITS, dtype=jnp.uint32)
+    return jnp.sum(jnp.where(bits, jnp.uint32(1) << bit, jnp.uint32(0)), axis=1, dtype=jnp.uint32)
+
+
+def rows_in_use(present: jax.Array) -> jax.Array:
+    """How many rows there are up to the last one that is present.
+
+    Args:
+      present: (N,) bool.
+
+    Returns:
+      () int32.
+
+    >>> int(rows_in_use(jnp.array([False, True, False])))
+    2
+    """
+    number = jnp.arange(1, present.shape[0] + 1, dtype=jnp.int32)
+    return greatest(jnp.where(present, number, 0), 0)
+
+
+def take(rows: jax.Array, index: jax.Array, fill: Any = 0) -> jax.Array:
+    """Rows at the indices, and `fill` at the sentinel or any other index beyond.
+
+    Args:
+      rows: (N, ...).
+      index: (...) int32, not negative.
+      fill: what an absent row holds.
+
+    Returns:
+      (..., ...) of the type of `rows`.
+    """
+    return rows.at[index].get(mode="fill", fill_value=fill)
+
+
+def lookup(table: jax.Array, *index: jax.Array) -> jax.Array:
+    """Entries of a table at indices that are known to lie inside.
+
+    One flat index: several would first be joined to rows, which costs more than the look-up (XLA, CPU). A
+    single entry is looked up as it is, since a loop that has another view of a table is no native one.
+
+    Args:
+      table: (A, B, ...), as many axes as there are indices.
+      *index: int32 arrays of one shape, each within its axis.
+
+    Returns:
+      The shape of the indices.
+    """
+    if index[0].size == 1 and table.ndim > 1:
+        return table.at[index].get(mode="clip")
+    flat = index[0]
+    for size, along in zip(table.shape[1:], index[1:], strict=True):
+        flat = flat * size + along
+    return jnp.take(table.reshape(-1), flat, mode="clip")
+
+
+def split_index(index: jax.Array, size: int) -> tuple[jax.Array, jax.Array]:
+    """Row and column of flat indices into a table of rows of a size.
+
+    Args:
+      index: int32, not negative: `//` and `%` of numbers that may be take several times as much code.
+      size: static.
+
+    Returns:
+      The quotients and the remainders.
+
+    >>> [part.tolist() for part in split_index(jnp.array([1, 7]), 3)]
+    [[0, 2], [1, 1]]
+    """
+    return jax.lax.div(index, jnp.int32(size)), jax.lax.rem(index, jnp.int32(size))
+
+
+def count_true(*masks: jax.Array) -> jax.Array:
+    """How many entries of each mask are True.
+
+    A sum of words counts five masks, each in bits of its own. The sums of those are of floats, since XLA
+    makes a tree of kernels of each long sum of integers.
+
+    Args:
+      *masks: (N,) bool each, of any sizes up to 2^24.
+
+    Returns:
+      (number of masks,) int32.
+
+    >>> count_true(jnp.array([True, False]), jnp.array([True, True, True])).tolist()
+    [1, 3]
+    """
+    bits = WORD_BITS.bit_length()
+    per_word = WORD_BITS // bits
+    size = max(mask.shape[0] for mask in masks)
+    size += -size % WORD_BITS
+    of_mask = [
+        jnp.where(jnp.pad(mask, (0, size - mask.shape[0])), jnp.int32(1 << k % per_word * bits), 0)
+        for k, mask in enumerate(masks)
+    ]
+    words = [functools.reduce(jnp.add, of_mask[k : k + per_word]) for k in range(0, len(masks), per_word)]
+    sums = jnp.stack([jnp.sum(word.reshape(-1, WORD_BITS), axis=1, dtype=jnp.int32) for word in words])
+    place = jnp.arange(per_word, dtype=jnp.int32)[None, :, None] * bits
+    counts = (sums[:, None] >> place) & (2**bits - 1)
+    return jnp.sum(counts.astype(jnp.float32), axis=-1).astype(jnp.int32).reshape(-1)[: len(masks)]
+
+
+def masked_mean(values: jax.Array, mask: jax.Array) -> jax.Array:
+    """Mean of the masked values along the last axis; 0 where there are none.
+
+    Args:
+      values: (..., N) float32.
+      mask: (..., N) bool.
+
+    Returns:
+      (...) float32.
+    """
+    total = jnp.sum(jnp.where(mask, values, 0), axis=-1)
+    # Counted in float32, exact to 2^24: a sum of integers is several times slower (XLA, CPU).
+    return total / jnp.maximum(jnp.sum(mask, axis=-1, dtype=jnp.float32), 1)
+
+
+def masked_std(values: jax.Array, mask: jax.Array) -> jax.Array:
+    """Population standard deviation of the masked values along the last axis.
+
+    The mean is taken off first: E[v^2] - E[v]^2 would cancel in float32.
+
+    Args:
+      values: (..., N) float32.
+      mask: (..., N) bool.
+
+    Returns:
+      (...) float32; 0 where there are none.
+    """
+    centred = values - masked_mean(values, mask)[..., None]
+    return jnp.sqrt(masked_mean(centred**2, mask))

@@ -1,0 +1,100 @@
+"""Points by group, at a fixed shape: sorted by the number of their cell or cluster."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.loops import store
+from jaxbox.xla.masked import WORD_BITS, prefix_sum
+
+
+def largest_first(size: jax.Array, max_size: int) -> tuple[jax.Array, jax.Array]:
+    """Orders rows by descending size, keeping their order within one.
+
+    Args:
+      size: (P,) int32, in [0, max_size].
+      max_size: static.
+
+    Returns:
+      order: (P,) int32 row indices.
+      place: (P,) int32: row i is order[place[i]].
+
+    >>> order, place = largest_first(jnp.array([1, 3, 1]), 4)
+    >>> order.tolist(), place.tolist()
+    ([1, 0, 2], [1, 0, 2])
+    """
+    num = jnp.int32(size.shape[0])
+    order, *_ = sort_by_group(lambda i: i, max_size - size, num, max_size + 1)
+    return order, jnp.zeros_like(order).at[order].set(jnp.arange(order.shape[0], dtype=order.dtype))
+
+
+def sort_by_group(
+    read: Callable[[jax.Array], Any], group: jax.Array, num_rows: jax.Array, num_groups: int, *, room: int = 0
+) -> tuple[Any, jax.Array, jax.Array]:
+    """Sorts rows by group, keeping their order within one.
+
+    Args:
+      read: gives the values of rows, a pytree of arrays, by their indices.
+      group: (N,) int32, in [0, num_groups).
+      num_rows: () int32; only the first so many rows count.
+      num_groups: static, K.
+      room: static, rows added at the end.
+
+    Returns:
+      values: pytree of (N + room,) arrays, sorted; anything finite beyond `num_rows`.
+      begin: (K,) int32: group k is rows begin[k] to end[k].
+      end: (K,) int32.
+
+    >>> letters = jnp.array([5, 6, 7])
+    >>> values, begin, end = sort_by_group(lambda i: letters[i], jnp.array([1, 0, 1]), jnp.int32(3), 2)
+    >>> values.tolist(), begin.tolist(), end.tolist()
+    ([6, 5, 7], [0, 1], [1, 3])
+    """
+    size = group.shape[0]
+    num_rows = jnp.minimum(num_rows, size)
+    group = store(jnp.where(jnp.arange(size, dtype=jnp.int32) < num_rows, group, num_groups))
+    count = jnp.zeros(num_groups, jnp.int32).at[group].add(1, mode="drop")
+    end = prefix_sum(count)
+
+    if on_accelerator():
+        values = _place_sorted(read, group, num_groups, room)
+    else:
+        values = _place_one_by_one(read, group, num_rows, end - count, room)
+    return values, end - count, end
+
+
+def _place_one_by_one(
+    read: Callable[[jax.Array], Any], group: jax.Array, num_rows: jax.Array, begin: jax.Array, room: int
+) -> Any:
+    """Counting sort: XLA compiles so small a loop to native code on the CPU."""
+
+    def step(i: jax.Array, state: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        # The count goes up before it is read: the other way round the whole array would be copied.
+        after, placed = state
+        after = after.at[group[i]].add(1, mode="promise_in_bounds")
+        place = after.at[group[i]].get(mode="promise_in_bounds") - 1
+        return after, jax.tree.map(lambda p, v: p.at[place].set(v, mode="promise_in_bounds"), placed, read(i))
+
+    shapes = jax.eval_shape(read, jax.ShapeDtypeStruct((), jnp.int32))
+    empty = jax.tree.map(lambda s: jnp.zeros(group.shape[0] + room, s.dtype), shapes)
+    return jax.lax.fori_loop(0, num_rows, step, (begin, empty))[1]
+
+
+def _place_sorted(read: Callable[[jax.Array], Any], group: jax.Array, num_groups: int, room: int) -> Any:
+    order = _stable_order(group, num_groups)
+    return jax.tree.map(lambda v: jnp.pad(v, (0, room)), read(order))
+
+
+def _stable_order(group: jax.Array, num_groups: int) -> jax.Array:
+    """(N,) int32 rows by group, in [0, num_groups], keeping their order within one."""
+    size = group.shape[0]
+    index_bits, group_bits = size.bit_length(), num_groups.bit_length()
+    index = jnp.arange(size, dtype=jnp.uint32)
+    if index_bits + group_bits > WORD_BITS:
+        return jax.lax.sort((group, index), num_keys=1, is_stable=True)[1].astype(jnp.int32)
+    # One packed word sorts several times faster than a key with its value.
+    packed = jax.lax.sort((group.astype(jnp.uint32) << index_bits) | index, is_stable=False)
+    return (packed & (2**index_bits - 1)).astype(jnp.int32)
