@@ -21,7 +21,8 @@ import jax
 import numpy as np
 
 from benchmarks import common
-from jaxbox import DetectorConfig, PointCloud, detector
+from jaxbox import DetectorConfig, PointCloud
+from jaxbox.run import compiled
 
 FRAMES, QUICK_FRAMES = 1000, 60
 CAPACITY = 2**17
@@ -89,7 +90,7 @@ def watch_run(preset: str, frames: int) -> dict[str, Any]:
 def program_memory(config: DetectorConfig) -> dict[str, float]:
     """What the compiler says of the detector, MB."""
     empty = PointCloud.from_numpy(np.zeros((0, 3), np.float32), capacity=CAPACITY)
-    memory: Any = detector.lower(empty, config).compile().memory_analysis()
+    memory: Any = compiled.lower(empty, config).compile().memory_analysis()
     parts = {"arguments": "argument", "outputs": "output", "scratch": "temp"}
     sizes = {name: getattr(memory, f"{part}_size_in_bytes") / 1e6 for name, part in parts.items()}
     return sizes | {"code": memory.generated_code_size_in_bytes / 1e6}

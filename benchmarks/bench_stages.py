@@ -20,8 +20,10 @@ import numpy as np
 
 import jaxbox
 from benchmarks import common
-from jaxbox import DetectorConfig, PointCloud, detector, steps
+from jaxbox import DetectorConfig, PointCloud, detector
 from jaxbox.io import Sweep
+from jaxbox.run import compiled
+from jaxbox.stages import clustering, evidence, filtering, ground
 
 MIN_SWEEPS, QUICK_SWEEPS = 80, 20
 """Different sweeps that a 99th percentile is taken over, at the least."""
@@ -43,7 +45,7 @@ RATE_CALLS = 10
 
 STEPS = (
     "select_points", "remove_ground", "gather_obstacles", "propose_clusters", "fit_rectangles",
-    "build_evidence", "complete_boxes", "score_boxes", "conclude",
+    "observe", "complete_boxes", "score_boxes", "assemble",
 )  # fmt: skip
 
 
@@ -101,9 +103,9 @@ def _repeat(function: Callable[[Any], Any], operand: Any) -> Any:
     return operand
 
 
-def floor(compiled: Any, rates: dict[str, float]) -> dict[str, float]:
+def floor(program: Any, rates: dict[str, float]) -> dict[str, float]:
     """Least time of a compiled function: its inputs and outputs, and its arithmetic, at the best rates."""
-    memory, cost = compiled.memory_analysis(), compiled.cost_analysis() or {}
+    memory, cost = program.memory_analysis(), program.cost_analysis() or {}
     moved = memory.argument_size_in_bytes + memory.output_size_in_bytes
     flops = max(float(cost.get("flops", 0)), 0.0)
     return {
@@ -117,38 +119,39 @@ def time_steps(
     clouds: Sequence[PointCloud], config: DetectorConfig, rates: dict[str, float]
 ) -> dict[str, dict[str, float]]:
     """Each step of detect() by itself, on what the steps before it found."""
-    compiled: dict[str, Callable[..., Any]] = {}
+    programs: dict[str, Callable[..., Any]] = {}
     floors: dict[str, dict[str, float]] = {}
     spent: dict[str, list[float]] = {name: [] for name in STEPS}
 
-    def run(name: str, *inputs: Any) -> Any:
-        if name not in compiled:
-            compiled[name] = jax.jit(getattr(steps, name)).lower(*inputs).compile()
-            floors[name] = floor(compiled[name], rates)
-        jax.block_until_ready(compiled[name](*inputs))
-        ms, result = common.milliseconds(functools.partial(compiled[name], *inputs))
+    def run(step: Callable[..., Any], *inputs: Any) -> Any:
+        name = step.__name__
+        if name not in programs:
+            programs[name] = jax.jit(step).lower(*inputs).compile()
+            floors[name] = floor(programs[name], rates)
+        jax.block_until_ready(programs[name](*inputs))
+        ms, result = common.milliseconds(functools.partial(programs[name], *inputs))
         spent[name].append(ms)
         return result
 
     for cloud in clouds:
-        sweep = run("select_points", cloud, config)
-        heights = run("remove_ground", sweep, config, jax.random.key(0))
-        obstacles = run("gather_obstacles", sweep, heights, config)
-        proposals = run("propose_clusters", obstacles, config)
-        fits = run("fit_rectangles", obstacles, proposals, config)
-        seen = run("build_evidence", sweep, heights, config)
-        trials, boxes, num_assignments = run("complete_boxes", fits, proposals, seen, config)
-        candidates = run("score_boxes", trials, boxes, proposals, obstacles, heights, seen, config)
-        found = obstacles, proposals, fits, candidates, num_assignments
-        run("conclude", cloud, sweep, heights, *found, config)
+        sweep = run(filtering.select_points, cloud, config.filtering, config.region)
+        terrain = run(ground.remove_ground, sweep, config.ground, jax.random.key(0))
+        obstacles = run(ground.gather_obstacles, sweep, terrain, config)
+        clusters = run(clustering.propose_clusters, obstacles, config)
+        outlines, rotations = run(detector.fit_rectangles, obstacles, clusters, config)
+        seen = run(evidence.observe, sweep, terrain, config.evidence)
+        segments = detector.Segments(sweep, terrain, obstacles, clusters, outlines, rotations, seen)
+        completed = run(detector.complete_boxes, segments, config)
+        candidates = run(detector.score_boxes, completed, segments, config)
+        run(detector.assemble, cloud, segments, completed, candidates, config)
     return {name: common.spread(spent[name]) | floors[name] for name in STEPS}
 
 
 def whole_program(cloud: PointCloud, config: DetectorConfig, rates: dict[str, float]) -> dict[str, float]:
     """Floor and memory of the whole compiled detector."""
-    compiled = detector.lower(cloud, config).compile()
-    memory: Any = compiled.memory_analysis()
-    return floor(compiled, rates) | {
+    program = compiled.lower(cloud, config).compile()
+    memory: Any = program.memory_analysis()
+    return floor(program, rates) | {
         "arguments_mb": memory.argument_size_in_bytes / 1e6,
         "outputs_mb": memory.output_size_in_bytes / 1e6,
         "scratch_mb": memory.temp_size_in_bytes / 1e6,

@@ -11,7 +11,8 @@ from jax.experimental import topologies
 from jax.sharding import NamedSharding, PartitionSpec
 
 from benchmarks import common
-from jaxbox import DetectorConfig, PointCloud, detector
+from jaxbox import DetectorConfig, PointCloud
+from jaxbox.run import compiled
 from jaxbox.xla.backend import building_for
 
 WHEELS = ("jax-cuda12-pjrt", "jax-cuda12-plugin", "nvidia-cuda-nvcc-cu12")
@@ -96,14 +97,14 @@ def compile_for_gpu(
     device = NamedSharding(topologies.make_mesh(topology, (1,), ("x",)), PartitionSpec())
     cloud = PointCloud.from_numpy(np.zeros((1, 3), np.float32), capacity=capacity)
     with building_for(accelerator=True):
-        first, *others = detector._operands(cloud, config, None)
+        first, *others = compiled._operands(cloud, config, None)
     lead = (batch,) if batch else ()
 
     def described(array: Any, lead: tuple[int, ...]) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((*lead, *array.shape), array.dtype, sharding=device)
 
     def counted_detect(*operands: Any) -> Any:
-        return detector._find(*operands)
+        return compiled._find(*operands)
 
     function = jax.vmap(counted_detect, (0, None, None)) if batch else counted_detect
     operands = [

@@ -15,6 +15,7 @@ from benchmarks.hlo_text import Frame
 from benchmarks.launch_model import Turns
 from benchmarks.xla_dump import key_of
 from jaxbox import DetectorConfig, PointCloud, detector
+from jaxbox.run import compiled
 from jaxbox.xla.backend import building_for
 
 CALLS = ("jit", "pjit", "closed_call")
@@ -40,8 +41,8 @@ def turns_of_sweeps(
     if not clouds:
         return {}
     with building_for(accelerator=True):
-        operands = [detector._operands(cloud, config, None) for cloud in clouds]
-    program = jax.make_jaxpr(detector._find_vehicles)(*operands[0])
+        operands = [compiled._operands(cloud, config, None) for cloud in clouds]
+    program = jax.make_jaxpr(compiled._find_vehicles)(*operands[0])
     run = jax.jit(lambda *values: evaluate(program.jaxpr, program.consts, values, no_turns(program.jaxpr))[1])
     tallies = [jax.device_get(run(*jax.tree.leaves(sweep))) for sweep in operands]
     return {key: _merge([tally[key] for tally in tallies], together) for key in tallies[0]}

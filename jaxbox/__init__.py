@@ -2,10 +2,10 @@
 
 from jaxbox._version import __version__
 from jaxbox.config import DEFAULT_CUT, DetectorConfig, propose_capacities
-from jaxbox.detector import detect
 from jaxbox.run import serialization as _serialization  # noqa: F401 - jax.export learns the types below
 from jaxbox.run.batching import detect_batch
 from jaxbox.run.cache import enable_cache
+from jaxbox.run.compiled import detect
 from jaxbox.run.streaming import StreamedSweep, stream
 from jaxbox.run.summary import Summary, summarise
 from jaxbox.types import Calibration, Detections, GroundPlane, Hulls, Label, PointCloud, Status, stack_clouds

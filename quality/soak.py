@@ -24,9 +24,10 @@ import numpy as np
 
 import jaxbox
 from benchmarks import common
-from jaxbox import DetectorConfig, detector
+from jaxbox import DetectorConfig
 from jaxbox._padding import CAPACITY_BUCKETS, fitting_capacity
 from jaxbox.io import open_sweeps
+from jaxbox.run import compiled
 from quality.bad_input import street
 
 FRAMES, QUICK_FRAMES = 20_000, 200
@@ -110,7 +111,7 @@ def soak(
     )
     for result in stream([*warm_up] * 2):
         _check(result)
-    warm_compiles, programs = counter.count, detector.count_compilations()
+    warm_compiles, programs = counter.count, compiled.count_compilations()
     intervals, capacities, points, memory = [], [], [], []
     last = time.perf_counter()
     for frame, result in enumerate(stream(sweeps)):
@@ -127,7 +128,7 @@ def soak(
         "points": {"least": min(points), "median": float(np.median(points)), "most": max(points)},
         "compiles_in_warm_up": warm_compiles,
         "programs": programs,
-        "recompiles": counter.count - warm_compiles + detector.count_compilations() - programs,
+        "recompiles": counter.count - warm_compiles + compiled.count_compilations() - programs,
         "frame_ms": latency(intervals),
         "frame_ms_by_capacity": {
             str(bucket): latency(np.array(intervals)[np.array(capacities) == bucket])

@@ -7,7 +7,8 @@ import jax
 import numpy as np
 import pytest
 
-from jaxbox import DetectorConfig, steps
+from jaxbox import DetectorConfig
+from jaxbox.config.checks import check_config
 from jaxbox.config.fields import replace_settings
 
 
@@ -21,7 +22,7 @@ def test_every_ablation_changes_the_default_preset_to_one_that_detect_takes(benc
     seen = [DetectorConfig()]
     for ablation in bench.ABLATIONS:
         config = replace_settings(DetectorConfig(), ablation.changes)
-        steps.check_settings(config)
+        check_config(config)
         assert config not in seen, f"{ablation.name} repeats another row"
         seen.append(config)
     assert len({ablation.name for ablation in bench.ABLATIONS}) == len(bench.ABLATIONS)

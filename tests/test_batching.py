@@ -9,9 +9,9 @@ import pytest
 from test_detector import CAPACITY, assert_same_bits, found, run, street
 
 import jaxbox
-from jaxbox import DetectorConfig, PointCloud, detect_batch, detector
+from jaxbox import DetectorConfig, PointCloud, detect_batch
 from jaxbox.config import EvidenceConfig
-from jaxbox.run import batching, streaming
+from jaxbox.run import batching, compiled, streaming
 
 SEEDS = (0, 1, 2)
 
@@ -51,9 +51,9 @@ def first_device():
 
 def test_a_batch_has_the_bits_of_the_singles_in_their_order_and_compiles_nothing_more():
     found(0)
-    compiled = detector.count_compilations()
+    before = compiled.count_compilations()
     batch = detect_batch([cloud(seed) for seed in SEEDS], devices=first_device())
-    assert detector.count_compilations() == compiled
+    assert compiled.count_compilations() == before
     for seed, detections in zip(SEEDS, batch, strict=True):
         assert_same_bits(jax.device_get(detections), found(seed))
 
@@ -92,13 +92,13 @@ def test_a_batch_of_nothing_is_nothing_and_one_without_devices_is_refused():
 
 def test_a_stream_has_the_bits_of_the_singles_and_compiles_nothing_more():
     found(0)
-    compiled = detector.count_compilations()
+    before = compiled.count_compilations()
     streamed = list(jaxbox.stream(recorded() * 2, capacity=CAPACITY, devices=first_device()))
     assert [result.name for result in streamed] == [f"street {seed}" for seed in SEEDS] * 2
     for seed, result in zip(SEEDS * 2, streamed, strict=True):
         assert result.num_points == len(street(seed).xyz)
         assert_same_bits(result.detections, found(seed))
-    assert detector.count_compilations() == compiled
+    assert compiled.count_compilations() == before
 
 
 def test_a_stream_takes_the_devices_in_turns_and_keeps_the_order(monkeypatch):

@@ -11,12 +11,12 @@ from test_detector import CAPACITY, assert_same_bits, found, street
 from typer.testing import CliRunner
 
 import jaxbox
-from jaxbox import PointCloud, detector
+from jaxbox import PointCloud
 from jaxbox.cli import app
 from jaxbox.config.fields import replace_settings
-from jaxbox.detector import count_compilations
-from jaxbox.run import cache, programs
+from jaxbox.run import cache, compiled, programs
 from jaxbox.run.cache import CacheFolders, CacheWarning, cache_folder, make_private
+from jaxbox.run.compiled import count_compilations
 
 PROJECT = pathlib.Path(__file__).parents[1]
 
@@ -24,7 +24,7 @@ PROJECT = pathlib.Path(__file__).parents[1]
 @pytest.fixture(autouse=True)
 def _as_it_was(monkeypatch):
     """Afterwards the cache is off again, and JAX's where the tests have it."""
-    monkeypatch.setattr(detector, "_programs", None)
+    monkeypatch.setattr(compiled, "_programs", None)
     users = jax.config.values["jax_compilation_cache_dir"]
     yield
     jax.config.update("jax_compilation_cache_dir", users)
@@ -54,10 +54,10 @@ def test_the_folder_is_made_for_its_owner_alone_whatever_the_umask(tmp_path, uma
 def test_the_variable_names_the_folder_or_switches_the_cache_off(tmp_path, monkeypatch):
     monkeypatch.setenv(cache.CACHE_VARIABLE, "")
     assert jaxbox.enable_cache() is None
-    assert detector.kept_programs() is None
+    assert compiled.kept_programs() is None
     monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "named"))
     assert jaxbox.enable_cache() == tmp_path / "named"
-    assert detector.kept_programs().folder == tmp_path / "named" / cache.PROGRAMS
+    assert compiled.kept_programs().folder == tmp_path / "named" / cache.PROGRAMS
 
 
 def refused(folder, match):
@@ -65,7 +65,7 @@ def refused(folder, match):
     users = jax.config.values["jax_compilation_cache_dir"]
     with pytest.warns(CacheWarning, match=match):
         assert jaxbox.enable_cache(folder) is None
-    assert detector.kept_programs().folder is None
+    assert compiled.kept_programs().folder is None
     assert jax.config.values["jax_compilation_cache_dir"] == users
 
 
@@ -165,12 +165,12 @@ def test_it_works_after_jax_has_compiled_something(tmp_path):
 def test_processes_that_are_started_get_the_same_folders(tmp_path):
     assert CacheFolders.of_this_process().is_enabled is False
     CacheFolders.of_this_process().apply()
-    assert detector.kept_programs() is None
+    assert compiled.kept_programs() is None
     jaxbox.enable_cache(tmp_path)
     folders = CacheFolders.of_this_process()
-    detector.use_programs(None)
+    compiled.use_programs(None)
     folders.apply()
     assert CacheFolders.of_this_process() == folders
     (tmp_path / cache.PROGRAMS).chmod(0o777)
     folders.apply()
-    assert detector.kept_programs().folder is None
+    assert compiled.kept_programs().folder is None

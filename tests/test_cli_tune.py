@@ -10,9 +10,9 @@ from typer.testing import CliRunner
 import jaxbox
 from jaxbox import synthetic
 from jaxbox.cli import app
-from jaxbox.detector import count_compilations
 from jaxbox.io import objects_from_detections, read_config, write_bin, write_calibration, write_labels
 from jaxbox.run import cache
+from jaxbox.run.compiled import count_compilations
 from jaxbox.tuning import Bench
 from jaxbox.types import PointCloud
 

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from test_masked import count_loops
 
-from jaxbox import DetectorConfig, PointCloud, Status, detect, detector, stack_clouds, synthetic
+from jaxbox import DetectorConfig, PointCloud, Status, detect, stack_clouds, synthetic
 from jaxbox.config import BoxConfig, EvidenceConfig
 from jaxbox.geometry.planar import rectangle_iou
 from jaxbox.io import open_sweeps
+from jaxbox.run import compiled
 from jaxbox.xla import backend
 from quality import bad_input
 
@@ -64,25 +65,25 @@ def assert_well_formed(detections, xyz, capacity=CAPACITY):
 def test_one_trace_serves_sweeps_of_any_length_and_any_thresholds_and_keys():
     xyz = street(0).xyz
     run(xyz)
-    size = detector._detect_jit._cache_size()
+    size = compiled._detect_jit._cache_size()
     for length in (0, 1, 777, len(xyz), CAPACITY + 5):
         run(np.resize(xyz, (length, 3)))
     number_types = (lambda v: 1.1 * v, lambda v: int(v) + 1, np.float32, np.float64, np.asarray)
     for seed, convert in enumerate(number_types):
         run(xyz, config=jax.tree.map(convert, DetectorConfig()), key=jax.random.key(seed))
-    assert detector._detect_jit._cache_size() == size
+    assert compiled._detect_jit._cache_size() == size
 
 
 def test_one_trace_serves_all_real_sweeps(data_root):
     folders = ("kitti_object/training", "pandaset", "argoverse2", "kitti_tracking/training")
     sweeps = [sweep for folder in folders for sweep in open_sweeps(data_root / folder)]
-    size = detector._detect_jit._cache_size()
+    size = compiled._detect_jit._cache_size()
     lengths = set()
     for sweep in sweeps[:23] + sweeps[23::8]:
         xyz = sweep.read_points()[0]
         lengths.add(len(xyz))
         assert_well_formed(run(xyz, capacity=2**17), xyz, 2**17)
-    assert detector._detect_jit._cache_size() <= size + 1
+    assert compiled._detect_jit._cache_size() <= size + 1
     assert len(lengths) > 20
 
 
@@ -114,8 +115,8 @@ def test_nothing_calls_back_to_the_host():
 @pytest.mark.codegen
 @pytest.mark.parametrize("preset", DetectorConfig.presets().values())
 def test_thresholds_go_in_as_one_array_that_native_loops_cut_up(preset):
-    settings = detector.PackedSettings.pack(preset, accelerator=False)
-    unpack = jax.jit(detector.PackedSettings.unpack)
+    settings = compiled.PackedConfig.pack(preset, accelerator=False)
+    unpack = jax.jit(compiled.PackedConfig.unpack)
     assert unpack(settings) == jax.tree.map(jnp.float32, preset)
     num_loops, num_native = count_loops(unpack, settings)
     assert num_native == num_loops > 1
@@ -175,8 +176,8 @@ def assert_shapes_of_singles(batch, size):
 
 def batch_anew(clouds):
     """A batch of clouds by a program of its own: tests that change how it is built leave nothing behind."""
-    find = jax.jit(jax.vmap(detector._find, (0, None, None)))
-    return find, detector._operands(clouds, None, None)
+    find = jax.jit(jax.vmap(compiled._find, (0, None, None)))
+    return find, compiled._operands(clouds, None, None)
 
 
 def test_a_batch_for_an_accelerator_has_the_shapes_of_the_singles_and_an_axis_more():
@@ -213,11 +214,11 @@ def test_only_an_accelerator_takes_a_batch_at_once_and_not_where_scatters_are_or
     accelerator, flags, together, monkeypatch
 ):
     monkeypatch.setenv("XLA_FLAGS", flags)
-    monkeypatch.setattr(detector, "_one_after_the_other", lambda a, _, b: a + b)
-    monkeypatch.setattr(detector, "_find_vehicles", lambda a, _, b: a - b)
+    monkeypatch.setattr(compiled, "_one_after_the_other", lambda a, _, b: a + b)
+    monkeypatch.setattr(compiled, "_find_vehicles", lambda a, _, b: a - b)
     a, b = jnp.arange(3.0), jnp.float32(2)
-    settings = detector.PackedSettings.pack(DetectorConfig(), accelerator=accelerator)
-    found, batched = detector._find_many(3, (True, False, False), a, settings, b)
+    settings = compiled.PackedConfig.pack(DetectorConfig(), accelerator=accelerator)
+    found, batched = compiled._find_many(3, (True, False, False), a, settings, b)
     assert batched
     np.testing.assert_array_equal(found, a - b if together else a + b)
 

@@ -7,7 +7,8 @@ import pytest
 from test_detector import CAPACITY, found, run, street
 
 import jaxbox
-from jaxbox import DetectorConfig, detector
+from jaxbox import DetectorConfig
+from jaxbox.run import compiled
 from quality import determinism, soak
 
 BOX = np.array([10.0, 2, -1, 4, 1.8, 1.5, 0.1, 0.5])
@@ -61,13 +62,13 @@ def test_clear_vehicles_are_there_with_every_key():
 
 def test_a_soak_of_small_sweeps_of_any_size_recompiles_nothing_and_loses_no_point():
     run(street(0).xyz)
-    programs = detector.count_compilations()
+    programs = compiled.count_compilations()
     sweeps = soak.varied_sweeps(street(0).xyz, CAPACITY, 200)
     assert {0, 1, CAPACITY} <= {sweep.size for sweep in sweeps}
     report = soak.soak(sweeps, sweeps[:1], DetectorConfig(), CAPACITY)
     assert (report["frames"], report["recompiles"], report["points"]["least"]) == (200, 0, 0)
     assert report["points"]["most"] == CAPACITY
-    assert detector.count_compilations() == programs
+    assert compiled.count_compilations() == programs
     assert 0 < report["frame_ms"]["p50"] <= report["frame_ms"]["p99.9"] <= report["frame_ms"]["max"]
 
 

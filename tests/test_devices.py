@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbox import DetectorConfig, PointCloud, detect, detector, synthetic
-from jaxbox.run import export
+from jaxbox import DetectorConfig, PointCloud, detect, synthetic
+from jaxbox.run import compiled, export
 from jaxbox.xla import backend
 
 CAPACITY = 2**14
@@ -19,7 +19,7 @@ MAX_LOOPS = 3
 
 def text_for(platform, preset="default"):
     cloud = PointCloud.from_numpy(np.zeros((1, 3), np.float32), capacity=CAPACITY)
-    return detector.lower(cloud, DetectorConfig.presets()[preset], platform=platform).as_text()
+    return compiled.lower(cloud, DetectorConfig.presets()[preset], platform=platform).as_text()
 
 
 @pytest.mark.codegen

@@ -12,7 +12,8 @@ import pytest
 from benchmarks import bench_launches, compile_ahead, hlo_text, launch_model, loop_turns, xla_dump
 from benchmarks.launch_model import Counts, Turns
 from benchmarks.xla_dump import Thunk
-from jaxbox import DetectorConfig, PointCloud, detector
+from jaxbox import DetectorConfig, PointCloud
+from jaxbox.run import compiled
 from jaxbox.xla.backend import building_for
 
 TREE = """\
@@ -348,7 +349,7 @@ def count_sorted(tally):
 @pytest.fixture
 def named(monkeypatch):
     """Names loops by their lines of this file."""
-    monkeypatch.setattr(detector, "__file__", __file__.replace(pathlib.Path(__file__).name, "detector.py"))
+    monkeypatch.setattr(compiled, "__file__", __file__.replace(pathlib.Path(__file__).name, "detector.py"))
 
 
 @pytest.mark.parametrize("number", [0, 1, 5, 1000])
@@ -400,8 +401,8 @@ def test_a_batch_turns_as_long_as_any_of_its_sweeps():
 def test_every_loop_of_the_program_for_an_accelerator_is_in_a_step_and_can_be_counted():
     cloud = PointCloud.from_numpy(np.zeros((1, 3), np.float32), capacity=16384)
     with building_for(accelerator=True):
-        operands = detector._operands(cloud, DetectorConfig(), None)
-    tally = loop_turns.no_turns(jax.make_jaxpr(detector._find_vehicles)(*operands).jaxpr)
+        operands = compiled._operands(cloud, DetectorConfig(), None)
+    tally = loop_turns.no_turns(jax.make_jaxpr(compiled._find_vehicles)(*operands).jaxpr)
     assert all(key.split(" < ")[-1] in bench_launches.STEPS for key in tally)
     assert len(tally) <= 3
 

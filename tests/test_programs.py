@@ -17,8 +17,8 @@ import pytest
 from test_detector import CAPACITY, assert_same_bits, found, street
 
 import jaxbox
-from jaxbox import DetectorConfig, PointCloud, detector
-from jaxbox.run import program_files, programs
+from jaxbox import DetectorConfig, PointCloud
+from jaxbox.run import compiled, program_files, programs
 from jaxbox.run.program_files import SUFFIX, BrokenProgramError, read_made_of
 from jaxbox.run.programs import Half, KeptPrograms
 
@@ -33,7 +33,7 @@ def changed(room, **values):
 
 def run(kept, cloud=CLOUD, config=BASE, key=None):
     """The answer, or None where `detect` would have to trace."""
-    return kept(*detector._operands(cloud, config, key))
+    return kept(*compiled._operands(cloud, config, key))
 
 
 def load(folder, config=BASE, *, capacity=CAPACITY, shipped=pathlib.Path("none")):

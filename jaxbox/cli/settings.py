@@ -4,10 +4,10 @@ import pathlib
 from collections.abc import Sequence
 
 from jaxbox.config import DetectorConfig
+from jaxbox.config.checks import check_config
 from jaxbox.config.fields import all_settings, base_of, parse_change, preset_settings, replace_settings
 from jaxbox.io import InputError, read_config
 from jaxbox.io.config import read_preset
-from jaxbox.steps import check_settings
 
 
 def chosen_config(
@@ -47,7 +47,7 @@ def chosen_config(
     except ValueError as error:
         raise InputError(f"--set: {error}") from error
     try:
-        check_settings(config)
+        check_config(config)
     except ValueError as error:
         raise InputError(str(error)) from error
     return config

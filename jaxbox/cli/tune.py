@@ -14,10 +14,10 @@ from jaxbox.cli.console import ExitCode, make_progress, print_error
 from jaxbox.cli.report import make_table
 from jaxbox.config import DetectorConfig
 from jaxbox.config.fields import PRESET_KEY, changed_settings
-from jaxbox.detector import count_compilations
 from jaxbox.evaluation.copies import COPIES, Frame, read_frame
 from jaxbox.evaluation.objectives import OBJECTIVES
 from jaxbox.io import InputError, atomic_writer, open_sweeps, read_drives
+from jaxbox.run.compiled import count_compilations
 from jaxbox.tuning import Axis, Bench, Trial
 
 

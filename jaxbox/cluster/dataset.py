@@ -21,11 +21,11 @@ from jaxbox.cluster.sources import SweepRef, list_sweeps
 from jaxbox.cluster.store import Store
 from jaxbox.cluster.worker import REPORT_KEY, SUFFIX, Partition, PartitionWorker, Task, is_attempt
 from jaxbox.config import DetectorConfig
+from jaxbox.config.checks import check_config
 from jaxbox.config.fields import differing_names, recorded_options, settings_from_toml, settings_to_toml
 from jaxbox.io._extras import require
 from jaxbox.run.cache import CacheFolders
 from jaxbox.run.versions import versions
-from jaxbox.steps import check_settings
 
 MANIFEST = "manifest.json"
 """The account of a run, beside its partitions."""
@@ -97,7 +97,7 @@ def detect_dataset(
         if value < 1:
             raise ValueError(f"{name} is {value}; it must be at least 1.")
     config = DetectorConfig() if config is None else config
-    check_settings(config)
+    check_config(config)
     task = Task(
         output=_absolute(os.fspath(output)),
         config=jax.tree.map(float, config),

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from jaxbox.config.schema import (
+    BoxConfig,
     ClusteringConfig,
     ComponentMap,
     DetectorConfig,
@@ -111,3 +112,13 @@ def _rough_warp(xy: np.ndarray, settings: ClusteringConfig) -> np.ndarray:
         max(float(settings.adaptive_growth), 1e-9),
     )
     return xy * (1 + (np.log1p(growth * beyond) / growth - beyond) / np.maximum(rho, 1e-9))[:, None]
+
+
+def obstacle_capacity(config: ClusteringConfig, num_rows: int) -> int:
+    """Capacity for points above the ground, of a cloud of so many rows."""
+    return config.max_obstacles or -(-3 * num_rows // 4)
+
+
+def slab_capacity(config: BoxConfig, num_rows: int) -> int:
+    """Capacity for the points that rectangles are fitted to, of a cloud of so many rows."""
+    return config.max_slab_points or -(-num_rows // 4)

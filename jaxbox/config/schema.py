@@ -293,7 +293,7 @@ class CompletionConfig:
 class VehicleConfig:
     """Vehicle decision: gates, score and suppression."""
 
-    surroundings: bool = _static(default=True)
+    neighbourhood: bool = _static(default=True)
     """static: judge a box, and measure its height, by all points in and round it; False keeps the height of
     the cluster, and lets nothing round the box count (the paper)."""
     classes: tuple[ClassPrior, ClassPrior, ClassPrior] = (CAR, VAN, TRUCK)
@@ -314,7 +314,7 @@ class VehicleConfig:
     """A point this far outside a box still counts as inside."""
     ring_m: Scalar = 0.5
     """A point farther outside than the margin but nearer than this speaks against the box."""
-    stray_share: Scalar = 0.01
+    top_quantile: Scalar = 0.01
     """Share of the points in a box that may lie above its top: a single return in the air is no roof."""
     top_margin_m: Scalar = 0.03
     """Added to the top of the points: beams seldom meet the very top."""
@@ -336,7 +336,7 @@ class VehicleConfig:
     """Points higher than this are glass, bonnet and roof; see ``ClassPrior.recess_m``."""
     recess_share: Scalar = 0.4
     """Full worth from this share of the upper points behind the faces on."""
-    upright_worth: Scalar = 0.2
+    upright_score: Scalar = 0.2
     """Worth of a box whose upper points are all on its faces: score x a factor from this to 1."""
     support_points: Scalar = 10.0
     """score x min(1, ground points round the box / this)."""
@@ -380,7 +380,7 @@ class DetectorConfig:
             evidence=EvidenceConfig(enabled=False),
             box=BoxConfig(criterion="area", fit_to="hull", scene_direction=False),
             completion=CompletionConfig(mode="none"),
-            vehicles=VehicleConfig(surroundings=False),
+            vehicles=VehicleConfig(neighbourhood=False),
         )
 
     @classmethod

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbox.config import DetectorConfig
-from jaxbox.detector import detect
 from jaxbox.evaluation.matching import count_points_in_boxes
 from jaxbox.geometry.planar import wrap_yaw
 from jaxbox.io import KittiObject, Sweep, boxes_from_objects, objects_from_detections
+from jaxbox.run.compiled import detect
 from jaxbox.types import Calibration, Detections, PointCloud, Status
 
 

@@ -35,6 +35,19 @@ def rotate(xy: jax.Array, yaw: jax.Array) -> jax.Array:
     return jnp.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
 
 
+def plane_residual(xyz: jax.Array, plane: jax.Array) -> jax.Array:
+    """Height over a plane: z - (a x + b y + c).
+
+    Args:
+      xyz: (..., 3) float32, m.
+      plane: (3,) float32: a, b, c.
+
+    Returns:
+      (...) float32, m.
+    """
+    return xyz[..., 2] - (plane[0] * xyz[..., 0] + plane[1] * xyz[..., 1] + plane[2])
+
+
 def rectangle_corners(center: jax.Array, size: jax.Array, yaw: jax.Array) -> jax.Array:
     """Corners of oriented rectangles, counter-clockwise from front left.
 

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from jaxbox.config import DetectorConfig
-from jaxbox.detector import detect
+from jaxbox.run.compiled import detect
 from jaxbox.types import Detections, PointCloud
 from jaxbox.xla.backend import default_device
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import jax
 from jax.experimental.compilation_cache import compilation_cache
 
-from jaxbox import detector
+from jaxbox.run import compiled
 from jaxbox.run.programs import KeptPrograms
 
 CACHE_VARIABLE = "JAXBOX_CACHE_DIR"
@@ -61,7 +61,7 @@ def enable_cache(folder: str | os.PathLike[str] | None = None) -> pathlib.Path |
     kept = None if problem else chosen
     if kept is not None:
         keep_compiled(kept)
-    detector.use_programs(KeptPrograms(None if kept is None else kept / PROGRAMS))
+    compiled.use_programs(KeptPrograms(None if kept is None else kept / PROGRAMS))
     return kept
 
 
@@ -136,7 +136,7 @@ class CacheFolders:
     @classmethod
     def of_this_process(cls) -> "CacheFolders":
         """As they are now."""
-        programs = detector.kept_programs()
+        programs = compiled.kept_programs()
         folder = programs.folder if isinstance(programs, KeptPrograms) else None
         return cls(
             compiled=jax.config.values["jax_compilation_cache_dir"],
@@ -150,4 +150,4 @@ class CacheFolders:
         if self.is_enabled:
             folder = None if self.programs is None else pathlib.Path(self.programs)
             is_refused = folder is None or make_private(folder) is not None
-            detector.use_programs(KeptPrograms(None if is_refused else folder))
+            compiled.use_programs(KeptPrograms(None if is_refused else folder))

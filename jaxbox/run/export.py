@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxbox._files import atomic_path
 from jaxbox._version import __version__
 from jaxbox.config import DetectorConfig
-from jaxbox.detector import detect
+from jaxbox.run.compiled import detect
 from jaxbox.types import Detections, PointCloud
 from jaxbox.xla.backend import building_for, on_accelerator
 

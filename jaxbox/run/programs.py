@@ -25,7 +25,8 @@ import jaxlib.version
 import numpy as np
 
 from jaxbox import detector
-from jaxbox.detector import PackedSettings
+from jaxbox.run import compiled
+from jaxbox.run.compiled import PackedConfig
 from jaxbox.run.program_files import SUFFIX, read_program, write_program
 from jaxbox.types import Detections, PointCloud
 from jaxbox.xla.backend import building_for, default_device
@@ -100,7 +101,7 @@ class Build:
 
 
 class KeptPrograms:
-    """What `detect` asks for a program that needs no tracing; see `jaxbox.detector.use_programs`.
+    """What `detect` asks for a program that needs no tracing; see `jaxbox.run.compiled.use_programs`.
 
     A program comes with the installation, or lies in the folder, or is traced and left there for the next
     run. Each half of it is compiled by a thread of its own, or loaded from JAX's cache.
@@ -123,7 +124,7 @@ class KeptPrograms:
         """Programs that were compiled, or loaded from the cache, in this process."""
         return len(self._compiled)
 
-    def __call__(self, cloud: PointCloud, settings: PackedSettings, key: jax.Array, /) -> Detections | None:
+    def __call__(self, cloud: PointCloud, settings: PackedConfig, key: jax.Array, /) -> Detections | None:
         """The bits of `detect`, or None where JAX has to trace it: for tracers, or other operands."""
         operands = cloud.xyz1, cloud.intensity, cloud.num_points, settings.thresholds, _key_data(key)
         device = _common_device(operands)
@@ -198,12 +199,12 @@ def trace(build: Build, half: Half) -> jax.export.Exported:
 
     def inputs(
         xyz1: jax.Array, intensity: jax.Array, num_points: jax.Array, thresholds: jax.Array, key: jax.Array
-    ) -> tuple[PointCloud, PackedSettings, jax.Array]:
-        settings = PackedSettings(thresholds, build.structure, build.accelerator)
+    ) -> tuple[PointCloud, PackedConfig, jax.Array]:
+        settings = PackedConfig(thresholds, build.structure, build.accelerator)
         return PointCloud(xyz1, intensity, num_points), settings, jax.random.wrap_key_data(key, impl=KEY_IMPL)
 
     def segment(*operands: jax.Array) -> detector.Segments:
-        return detector.segment_packed(*inputs(*operands))
+        return compiled.segment_packed(*inputs(*operands))
 
     operands = build.operands()
     export = functools.partial(jax.export.export, platforms=[build.platform])
@@ -215,7 +216,7 @@ def trace(build: Build, half: Half) -> jax.export.Exported:
         def decide(*values: jax.Array) -> list[jax.Array]:
             cloud, settings, _ = inputs(*values[: len(operands)])
             segments = jax.tree.unflatten(structure, values[len(operands) :])
-            return jax.tree.leaves(detector.decide_packed(cloud, segments, settings))
+            return jax.tree.leaves(compiled.decide_packed(cloud, segments, settings))
 
         return export(jax.jit(decide))(*operands, *found)
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from jaxbox._padding import aligned_empty, checked_points, fill_rows, fitting_capacity
 from jaxbox.config import DetectorConfig
+from jaxbox.config.checks import check_config
 from jaxbox.run.batching import checked_devices, detect_on
 from jaxbox.run.processes import ProcessPool, WorkerDied, ahead
-from jaxbox.steps import check_settings
 from jaxbox.types import Detections, PointCloud
 
 NUM_BUFFERS = 3
@@ -88,7 +88,7 @@ def stream(
     if workers < 1:
         raise ValueError(f"workers is {workers}; it must be at least 1.")
     config = DetectorConfig() if config is None else config
-    check_settings(config)
+    check_config(config)
     if workers == 1:
         return _stream_here(sweeps, config, key, capacity, checked_devices(devices))
     if devices is not None:

@@ -1,40 +1,111 @@
-"""Clustering on grids: connected components as proposals (paper, section 3.2, Algorithm II)."""
+"""Clustering by grid subdivision: connected components as proposals (paper, section 3.2, Algorithm II)."""
 
 import dataclasses
-import functools
 import itertools
 import math
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 
-from jaxbox.xla.backend import on_accelerator
-from jaxbox.xla.loops import at_once
-from jaxbox.xla.masked import WORD_BITS, lookup, prefix_sum, take
-
-STRIP_WORDS = 32
-"""R, words of a strip of consecutive cells. The strips lie side by side in tables (R, S), so that sums along
-the cells are sums of R long rows."""
-
-STRIP = STRIP_WORDS * WORD_BITS
-"""Cells of a strip."""
-
-WORD_SHIFT, STRIP_SHIFT = WORD_BITS.bit_length() - 1, STRIP.bit_length() - 1
-"""Shifts instead of divisions: words and strips are powers of two."""
-
-MAX_STARTS = WORD_BITS // 2
-"""Runs that can start among the cells of one word: an empty cell lies between two."""
-
-HOOKS, JUMPS = 4, 2
-"""Rounds of `_join_in_rounds` before it looks whether they were enough, and jumps of each."""
-
-NONE = 0
-"""Cell, run and component of points that have none; the others count from 1."""
+from jaxbox.config import BoxConfig, ClusteringConfig, DetectorConfig, RegionConfig, VehicleConfig
+from jaxbox.stages.state import Clusters, Obstacles
+from jaxbox.xla.barriers import materialize, single_kernel
+from jaxbox.xla.components import NONE, CellGrids, label_components
+from jaxbox.xla.loops import map_rows
+from jaxbox.xla.maps import flag_cells, map_tables
+from jaxbox.xla.rows import compact, lookup, prefix_sum, take
+from jaxbox.xla.segments import reduce_segments
 
 
-def warp_range(xy: jax.Array, *, start_m: jax.Array | float, growth: jax.Array | float) -> jax.Array:
-    """Draws far points together, so that a fixed grid links farther apart where beams spread.
+def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Clusters:
+    """Labels the components of every map, and lists the clusters that pass the size gates.
+
+    Args:
+      obstacles: O points.
+      config: of the detector: the maps, the region, the slab's heights, and what large clusters are.
+
+    Returns:
+      The clusters, map after map, and which of them each point belongs to.
+    """
+    maps, num = config.clustering.maps, obstacles.height.shape[0]
+    grids = arrange_grids(config.clustering, config.region)
+    cell, flags = _find_cells(obstacles, grids, config)
+    components = label_components(flags, grids, max_runs=sum(m.max_cells for m in maps))
+    component = map_tables(
+        lambda cell, _: components.at(cell), cell, num_rows=obstacles.count, init=jnp.zeros_like(cell)
+    )
+    statistics = find_statistics(
+        component[:, :num],
+        obstacles.count,
+        obstacles.xy,
+        obstacles.height,
+        _in_slab(obstacles.height, config.box),
+        max_components=components.of_run.shape[0],
+    )
+    chosen = select_clusters(
+        statistics, components.first, config.clustering, min_extent_m=config.vehicles.min_extent_m
+    )
+    fit_all = chosen.num_slab.astype(jnp.float32) < config.box.min_slab_points
+    of_point, fitted = _find_clusters(obstacles, component, chosen.row, fit_all, config.box)
+    num_fitted = jnp.where(fit_all, chosen.num_points, chosen.num_slab)
+    large, num_large = _large_clusters(chosen, config.vehicles)
+    return Clusters(
+        component=component[0, :num] - 1,
+        of_point=of_point[:, :num],
+        fitted=fitted[:, :num],
+        num=jnp.sum(chosen.kept, dtype=jnp.int32),
+        num_first=chosen.kept[0],
+        num_points=chosen.num_points,
+        low=chosen.low,
+        high=chosen.high,
+        large=large,
+        num_large=num_large,
+        num_runs=components.num_runs,
+        num_found=chosen.found,
+        num_slab=jnp.max(chosen.sum_by_map(num_fitted)),
+    )
+
+
+def arrange_grids(config: ClusteringConfig, region: RegionConfig) -> CellGrids:
+    """Arranges the cells of the maps, which cover the region, in one row.
+
+    Args:
+      config: the maps.
+      region: that they cover.
+
+    Returns:
+      The grids, which are static.
+    """
+
+    def num_cells(half_m: float, cell_m: float) -> int:
+        return math.ceil(2 * half_m / cell_m)
+
+    sides = [
+        (num_cells(region.half_x_m, m.cell_m), num_cells(region.half_y_m, m.cell_m)) for m in config.maps
+    ]
+    return CellGrids(tuple((*side, m.num_levels) for side, m in zip(sides, config.maps, strict=True)))
+
+
+def _find_cells(
+    obstacles: Obstacles, grids: CellGrids, config: DetectorConfig
+) -> tuple[jax.Array, jax.Array]:
+    """The cell of each point on each map, (maps, O), and the flags of the occupied cells."""
+
+    def compress(columns: tuple[jax.Array, jax.Array]) -> jax.Array:
+        return compress_range(
+            columns[0],
+            start_m=config.clustering.adaptive_start_m,
+            growth=config.clustering.adaptive_growth,
+        )
+
+    def find(xy: jax.Array, columns: tuple[jax.Array, jax.Array], valid: jax.Array) -> list[jax.Array]:
+        return find_cells(xy, columns[1], valid, grids, config.clustering, config.region)
+
+    return flag_cells(find, compress, (obstacles.xy, obstacles.height), obstacles.count, grids)
+
+
+def compress_range(xy: jax.Array, *, start_m: jax.Array | float, growth: jax.Array | float) -> jax.Array:
+    """Compresses far ranges, so that a fixed grid links farther apart where beams spread.
 
     The range becomes start + log(1 + growth (range - start)) / growth beyond the start, so a step dr out
     there shrinks by 1 + growth (range - start): the linking distance grows by that factor along the beam,
@@ -48,7 +119,7 @@ def warp_range(xy: jax.Array, *, start_m: jax.Array | float, growth: jax.Array |
     Returns:
       (N, 2) float32, m, same direction, shorter range.
 
-    Reference: oracle `jaxbox.reference.warp_range`.
+    Reference: oracle `jaxbox.reference.compress_range`.
     """
     rho = jnp.sqrt(xy[:, 0] ** 2 + xy[:, 1] ** 2)
     beyond = jnp.maximum(rho - start_m, 0)
@@ -59,368 +130,207 @@ def warp_range(xy: jax.Array, *, start_m: jax.Array | float, growth: jax.Array |
     return xy * scale[:, None]
 
 
-@dataclasses.dataclass(frozen=True)
-class CellRow:
-    """The cells of several maps in one row, so that each pass over points or cells serves all maps.
-
-    A bird's-eye view map has its cells in lines along y, a 3D map in lines along the height. An empty cell
-    ends each line, an empty line each sheet of lines (x), and an empty sheet lies before and after each map:
-    no step to a neighbour needs a check of the border. Cell 0 stands for no cell.
-    """
-
-    shapes: tuple[tuple[int, int, int], ...]
-    """Cells of each map along x, y and height."""
-
-    @functools.cached_property
-    def strides(self) -> list[tuple[int, int, int]]:
-        """Steps along x, y and height on each map."""
-        return [
-            (y + 1, 1, 0) if levels == 1 else ((y + 1) * (levels + 1), levels + 1, 1)
-            for _, y, levels in self.shapes
-        ]
-
-    @functools.cached_property
-    def starts(self) -> list[int]:
-        """First cell of each map, at the start of a strip, and the end of the row."""
-        starts, end = [], 1
-        for shape, (sheet, line, _) in zip(self.shapes, self.strides, strict=True):
-            border = sheet + line + 1
-            starts.append(-(-(end + border) // STRIP) * STRIP)
-            end = starts[-1] + shape[0] * sheet + border
-        return [*starts, -(-end // STRIP) * STRIP]
-
-    @property
-    def num_strips(self) -> int:
-        """S, strips that cover the row."""
-        return self.starts[-1] // STRIP
-
-    @property
-    def num_flags(self) -> int:
-        """Flags of all cells, see `flag`."""
-        return self.num_strips * STRIP
-
-    @property
-    def lines_back(self) -> list[tuple[int, ...]]:
-        """How far back the same cell lies on each neighbouring line that comes before, on each map."""
-        return [
-            (sheet,) if levels == 1 else (line, sheet - line, sheet, sheet + line)
-            for (_, _, levels), (sheet, line, _) in zip(self.shapes, self.strides, strict=True)
-        ]
-
-    def flag(self, cell: jax.Array) -> jax.Array:
-        """Where the flag of a cell lies: cell c of all strips side by side, so that packing adds up rows.
-
-        On an accelerator the flags lie as the cells do: there a sum over neighbours is the faster one.
-        """
-        if on_accelerator():
-            return cell
-        return (cell & (STRIP - 1)) * self.num_strips + (cell >> STRIP_SHIFT)
-
-
-def arrange_cells(
-    cell_m: Sequence[float], num_levels: Sequence[int], *, half_x_m: float, half_y_m: float
-) -> CellRow:
-    """Arranges the cells of the maps, which cover the region; all arguments are static."""
-    return CellRow(
-        tuple(
-            (math.ceil(2 * half_x_m / size), math.ceil(2 * half_y_m / size), levels)
-            for size, levels in zip(cell_m, num_levels, strict=True)
-        )
-    )
-
-
 def find_cells(
     xy: jax.Array,
     height: jax.Array,
-    present: jax.Array,
-    *,
-    row: CellRow,
-    cell_m: Sequence[float],
-    min_height_m: Sequence[jax.Array | float],
-    max_height_m: Sequence[jax.Array | float],
-    half_x_m: float,
-    half_y_m: float,
+    valid: jax.Array,
+    grids: CellGrids,
+    config: ClusteringConfig,
+    region: RegionConfig,
 ) -> list[jax.Array]:
     """Cells of points on each map.
 
     Args:
       xy: (N, 2) float32, m; points beyond the border of the region join its edge.
       height: (N,) float32, m, above the ground; points beyond the levels join the end levels.
-      present: (N,) bool, points that count on any map.
-      row: static, see `arrange_cells`.
-      cell_m: static, edge of the cells of each map.
-      min_height_m: of each map, m: lower points do not count, and the lowest level starts here.
-      max_height_m: of each map, m: higher points do not count.
-      half_x_m: static.
-      half_y_m: static.
+      valid: (N,) bool, points that count on any map.
+      grids: static, see `arrange_grids`.
+      config: the maps: points outside a map's heights do not count on it, and its lowest level starts at the
+        least.
+      region: that the maps cover.
 
     Returns:
       (N,) int32 of each map, `NONE` for points that do not count.
     """
     cells = []
-    for i, (size, low, high) in enumerate(zip(cell_m, min_height_m, max_height_m, strict=True)):
-        cell = jnp.int32(row.starts[i])
-        distances = xy[:, 0] + half_x_m, xy[:, 1] + half_y_m, height - low
-        for distance, count, stride in zip(distances, row.shapes[i], row.strides[i], strict=True):
-            index = jnp.floor(distance / size).astype(jnp.int32)
+    for i, on_map in enumerate(config.maps):
+        cell = jnp.int32(grids.starts[i])
+        low, high = on_map.min_height_m, on_map.max_height_m
+        distances = xy[:, 0] + region.half_x_m, xy[:, 1] + region.half_y_m, height - low
+        for distance, count, stride in zip(distances, grids.shapes[i], grids.strides[i], strict=True):
+            index = jnp.floor(distance / on_map.cell_m).astype(jnp.int32)
             cell = cell + jnp.clip(index, 0, count - 1) * stride
-        cells.append(jnp.where(present & (height > low) & (height < high), cell, NONE))
+        cells.append(jnp.where(valid & (height > low) & (height < high), cell, NONE))
     return cells
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Components:
-    """The connected components of all maps: in the order of the maps, and of their first cells."""
+class Statistics:
+    """What the size gates ask of each component."""
 
-    starts: jax.Array
-    """(R, S) uint32: bits of the cells at which runs start, see `_pack`."""
-    runs_before: jax.Array
-    """(R, S) int32: runs that start before each word."""
-    of_run: jax.Array
-    """(C,) int32: component of each run."""
-    first: jax.Array
-    """(maps + 1,) int32: first component of each map, and one past the last."""
-    num_runs: jax.Array
-    """(maps,) int32: runs of each map, of which there may be more than C."""
+    table: jax.Array
+    """(C, 8) float32: greatest x, y, height, -x, -y and -height, m; points, and those of them between the
+    slab's heights, which float32 counts exactly up to 2^24."""
 
-    def at(self, cell: jax.Array) -> jax.Array:
-        """Component of occupied cells: `NONE` at that cell, and in runs beyond the capacity."""
-        place = _place(cell, self.starts.shape[1])
-        return take(self.of_run, _run_at(self.starts, self.runs_before, place), NONE)
+    @property
+    def upper(self) -> jax.Array:
+        """(C, 6) float32, m: greatest x, y, height, -x, -y and -height."""
+        return self.table[:, :6]
+
+    @property
+    def num_points(self) -> jax.Array:
+        """(C,) int32."""
+        return self.table[:, 6].astype(jnp.int32)
+
+    @property
+    def num_slab(self) -> jax.Array:
+        """(C,) int32: points between the slab's heights."""
+        return self.table[:, 7].astype(jnp.int32)
 
 
-def label_components(flags: jax.Array, row: CellRow, *, max_runs: int) -> Components:
-    """Connected components of the occupied cells of each map, with all 8 (in 3D 26) neighbours linked.
-
-    Nodes are the runs of occupied cells along a line. Where two runs on neighbouring lines touch first, one
-    of them starts: so one look-up on each line before and one on each line after the start of every run find
-    all links. A CPU joins runs link after link (union-find). Elsewhere the first look-up makes a forest;
-    over the others its trees hook onto lower ones, and pointers jump, until nothing moves (Shiloach and
-    Vishkin, 1982).
-
-    On 20 KITTI object frames, 3D components of 0.35 m cells agree with the paper's queue over a KD-tree
-    (Algorithm II) at a radius of 0.6 m to a median adjusted Rand index of 0.98, at least 0.82
-    (python -m benchmarks.bench_clustering_agreement).
+def find_statistics(
+    component: jax.Array,
+    num_points: jax.Array,
+    xy: jax.Array,
+    height: jax.Array,
+    in_slab: jax.Array,
+    *,
+    max_components: int,
+) -> Statistics:
+    """Counts the points of each component, and finds its bounds.
 
     Args:
-      flags: (F,) uint8, 1 at `CellRow.flag` of occupied cells; that of `NONE` is not looked at.
-      row: static, the cells.
-      max_runs: static, C, of all maps together; runs beyond it belong to no component.
+      component: (maps, N) int32 of each point on each map.
+      num_points: () int32; only the first so many points count.
+      xy: (N, 2) float32, m.
+      height: (N,) float32, m, above the ground.
+      in_slab: (N,) bool.
+      max_components: static, C.
 
     Returns:
-      The components.
-
-    Reference: oracle `scipy.ndimage.label`.
+      The statistics; no points, and bounds of minus infinity, where there are none.
     """
-    words = _pack(flags, row.num_strips)
-    words = words.at[0, 0].set(words[0, 0] | 1)  # The run of no cell, before all others.
-    after = _shift(words)
-    starts = words & ~after
-    runs_before, num_runs = _prefix(_population(starts))
 
-    runs = _Runs(
-        touched=((words | after).reshape(-1), words.reshape(-1)),
-        starts=starts.reshape(-1),
-        before=runs_before.reshape(-1),
-        cell=_starting_cells(starts, runs_before, max_runs),
-        num=jnp.minimum(num_runs, max_runs),
+    def describe(point: tuple[jax.Array, ...]) -> tuple[list[jax.Array], list[jax.Array]]:
+        xy, height, in_slab = point
+        x, y = xy[..., 0], xy[..., 1]
+        return [x, y, height, -x, -y, -height], [jnp.ones_like(height), in_slab.astype(jnp.float32)]
+
+    rows = xy, height, in_slab
+    return Statistics(
+        reduce_segments(describe, rows, component, num_rows=num_points, num_segments=max_components)
     )
-    parent = _join_in_rounds(row, runs) if on_accelerator() else _join_one_by_one(row, runs)
-    itself = jnp.arange(max_runs, dtype=jnp.int32)
-    number = prefix_sum((parent == itself) & (itself < num_runs)) - 1
-
-    def count() -> tuple[jax.Array, jax.Array]:
-        first_run = [runs_before[0, start // STRIP] for start in row.starts[:-1]] + [num_runs]
-        num_of_map = [after - before for before, after in itertools.pairwise(first_run)]
-        return jnp.stack([lookup(number, run - 1) + 1 for run in first_run]), jnp.stack(num_of_map)
-
-    first, num_of_map = at_once(count)
-    return Components(
-        starts=starts,
-        runs_before=runs_before,
-        of_run=lookup(number, parent),
-        first=first,
-        num_runs=num_of_map,
-    )
-
-
-def _pack(flags: jax.Array, num_strips: int) -> jax.Array:
-    """(R, S) uint32 words of the flags: word r of strip s holds cells r WORD_BITS and on of that strip."""
-    bit = jnp.arange(WORD_BITS, dtype=jnp.uint32)
-    if on_accelerator():
-        rows = flags.reshape(num_strips, STRIP_WORDS, WORD_BITS).astype(jnp.uint32)
-        return jnp.sum(rows << bit[None, None], axis=2, dtype=jnp.uint32).T
-    rows = flags.reshape(STRIP_WORDS, WORD_BITS, num_strips).astype(jnp.uint32)
-    return jnp.sum(rows << bit[None, :, None], axis=1, dtype=jnp.uint32)
-
-
-def _shift(words: jax.Array) -> jax.Array:
-    """(R, S) uint32: every bit one cell on."""
-    last_before = jnp.pad(words[-1:, :-1], ((0, 0), (1, 0)))
-    return words << 1 | jnp.concatenate([last_before, words[:-1]]) >> WORD_BITS - 1
-
-
-def _prefix(count: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Sum of the counts (R, S) of all words before each, and of all words."""
-    of_strip = jnp.sum(count, axis=0, dtype=jnp.int32)
-    up_to = prefix_sum(of_strip)
-    if on_accelerator():
-        return jnp.cumsum(count, axis=0) - count + (up_to - of_strip)[None], up_to[-1]
-    _, before = jax.lax.scan(lambda before, row: (before + row, before), up_to - of_strip, count)
-    return before, up_to[-1]
-
-
-def _population(words: jax.Array) -> jax.Array:
-    return jax.lax.population_count(words).astype(jnp.int32)
-
-
-Place = tuple[jax.Array, jax.Array]
-"""Where the words (R, S), row after row, hold a cell: in which of them, and as which bit."""
-
-
-def _place(cell: jax.Array, num_strips: int) -> Place:
-    word, strip = (cell & (STRIP - 1)) >> WORD_SHIFT, cell >> STRIP_SHIFT
-    return word * num_strips + strip, (cell & (WORD_BITS - 1)).astype(jnp.uint32)
-
-
-def _is_set(words: jax.Array, place: Place) -> jax.Array:
-    word, bit = place
-    return jnp.take(words, word, mode="clip") >> bit & 1 == 1
-
-
-def _run_at(starts: jax.Array, runs_before: jax.Array, place: Place) -> jax.Array:
-    """The last run that starts at a cell or before it."""
-    word, bit = place
-    up_to = jnp.take(starts, word, mode="clip") & ((jnp.uint32(2) << bit) - 1)
-    return jnp.take(runs_before, word, mode="clip") + _population(up_to) - 1
-
-
-def _starting_cells(starts: jax.Array, runs_before: jax.Array, size: int) -> jax.Array:
-    """(size,) int32: the cell at which each run starts; any beyond the last run."""
-    words, strips = starts.shape
-    strip, word = jnp.arange(strips, dtype=jnp.int32)[None], jnp.arange(words, dtype=jnp.int32)[:, None]
-    cell = strip * STRIP + word * WORD_BITS
-    first = jnp.where(starts > 0, runs_before, size)
-    cell = jnp.zeros(size, jnp.int32).at[first.reshape(-1)].set(cell.reshape(-1), mode="drop")
-    # The first run of each word knows where the word begins; its other runs come next.
-    for step in (1, 2, 4, 8):
-        cell = jnp.maximum(cell, jnp.pad(cell, (step, 0))[:size])
-    word, _ = _place(cell, strips)
-    rank = jnp.arange(size, dtype=jnp.int32) - jnp.take(runs_before, word, mode="clip")
-    bits = jnp.take(starts, word, mode="clip")
-    for k in range(MAX_STARTS - 1):
-        bits = jnp.where(rank > k, bits & (bits - 1), bits)
-    return cell + _population((bits & -bits) - 1)
-
-
-def _by_map(row: CellRow, cell: jax.Array) -> list[jax.Array]:
-    """`CellRow.lines_back` at each cell; 0, which leads to the cell itself, where its map has fewer lines."""
-    steps = []
-    for back in itertools.zip_longest(*row.lines_back, fillvalue=0):
-        step = jnp.full_like(cell, back[0])
-        for start, other in zip(row.starts[1:-1], back[1:], strict=True):
-            step = jnp.where(cell >= start, other, step)
-        steps.append(step)
-    return steps
-
-
-def _beside(row: CellRow, cell: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
-    """Where a run that starts at each cell may touch others: on each line before it, and on each line after.
-
-    Two runs touch first where the one on the later line starts: then the other holds that cell of its line
-    or the one before; or one cell before the other starts: then the one on the later line holds that.
-    """
-    back = _by_map(row, cell)
-    return [cell - b for b in back], [cell + b - 1 for b in back]
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class _Runs:
-    """Runs of occupied cells along a line: the nodes of the graph whose components are sought."""
+class ChosenComponents:
+    """The components that pass the size gates, in one list of P rows: map by map, without gaps."""
 
-    touched: tuple[jax.Array, jax.Array]  # (R S,) uint32, bits to look at on lines before, and on lines after
-    starts: jax.Array  # (R S,) uint32, bits of the cells at which runs start
-    before: jax.Array  # (R S,) int32, runs that start before each word
-    cell: jax.Array  # (C,) int32, at which each run starts
-    num: jax.Array  # () int32, at most C
+    row: jax.Array
+    """(C,) int32: row of each component, or P where it is no cluster."""
+    num_points: jax.Array
+    """(P,) int32: points of each cluster; 0 for an empty row."""
+    num_slab: jax.Array
+    """(P,) int32: those of them between the slab's heights."""
+    low: jax.Array
+    """(P, 3) float32, m: least x, y and height above the ground of each cluster; 0 for an empty row."""
+    high: jax.Array
+    """(P, 3) float32, m: greatest ones."""
+    found: jax.Array
+    """(maps,) int32: clusters of each map that pass the gates, which may exceed its capacity."""
+    kept: jax.Array
+    """(maps,) int32: those in the list."""
 
-    def look(self, row: CellRow, side: int, cell: jax.Array, node: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Whether each node touches a run at the cell beside its line (before, 0, or after, 1), and which."""
-        place = _place(cell, row.num_strips)
-        other = _run_at(self.starts, self.before, place)
-        exist = (node > NONE) & (node < self.num) & (other < self.num)
-        return exist & _is_set(self.touched[side], place), other
+    def sum_by_map(self, values: jax.Array) -> jax.Array:
+        """(maps,) sums of values (P,) of the clusters over each map."""
+        end = jnp.cumsum(self.kept)[:, None]
+        row = jnp.arange(values.shape[0], dtype=jnp.int32)[None]
+        own = (row >= end - self.kept[:, None]) & (row < end)
+        return jnp.sum(jnp.where(own, values, 0), axis=1, dtype=values.dtype)
 
 
-def _join_one_by_one(row: CellRow, runs: _Runs) -> jax.Array:
-    """(C,) int32: the lowest node of each node's component, by a union-find, link after link.
+def select_clusters(
+    statistics: Statistics, first: jax.Array, config: ClusteringConfig, *, min_extent_m: jax.Array | float
+) -> ChosenComponents:
+    """Keeps the components that may be a vehicle: enough points, not too short, and not too long.
 
-    XLA compiles so small loops to native code on the CPU.
+    Args:
+      statistics: of the C components.
+      first: (maps + 1,) int32: first component of each map, and one past the last.
+      config: capacities of the maps, beyond which clusters are left out, and the gates on points and extent.
+      min_extent_m: least diagonal of the extents along x and y, m: no rectangle has a longer side.
+
+    Returns:
+      The clusters, in the order of the components.
     """
+    max_clusters = [m.max_clusters for m in config.maps]
+    capacity = sum(max_clusters)
+    upper, num_points = statistics.upper, statistics.num_points
+    component = jnp.arange(num_points.shape[0], dtype=jnp.int32)
+    enough = num_points.astype(jnp.float32) >= jnp.maximum(config.min_points, 1.0)
+    keep = enough & (component >= first[0]) & (component < first[-1])
+    extent_x, extent_y = upper[:, 0] + upper[:, 3], upper[:, 1] + upper[:, 4]
+    keep = keep & (jnp.maximum(extent_x, extent_y) <= config.max_extent_m)
+    keep = keep & (extent_x**2 + extent_y**2 >= min_extent_m**2)
+    keep, order = materialize((keep, prefix_sum(keep)))
 
-    def find_root(node: jax.Array, parent: jax.Array) -> jax.Array:
-        return jax.lax.while_loop(lambda i: lookup(parent, i) != i, lambda i: lookup(parent, i), node)
+    def count() -> tuple[list[jax.Array], jax.Array, list[jax.Array], list[jax.Array]]:
+        end = [lookup(order, first[i] - 1) for i in range(len(max_clusters) + 1)]
+        found = [after - before for before, after in itertools.pairwise(end)]
+        kept = [jnp.minimum(each, size) for each, size in zip(found, max_clusters, strict=True)]
+        return end, jnp.stack(found), kept, list(itertools.accumulate(kept))
 
-    def set_parent(parent: jax.Array, node: jax.Array, root: jax.Array) -> jax.Array:
-        return parent.at[node].set(root, mode="promise_in_bounds")
+    end, found, kept, kept_up_to = single_kernel(count)
+    # The lists of the maps join without gaps.
+    row = jnp.full_like(order, capacity)
+    for i, size in enumerate(max_clusters):
+        place = order - end[i]
+        listed = keep & (place > 0) & (place <= size)
+        row = jnp.where(listed, place - 1 + kept_up_to[i] - kept[i], row)
+    member = jnp.full(capacity, num_points.shape[0], jnp.int32).at[row].set(component, mode="drop")
 
-    def join(side: int, k: int, node: jax.Array, parent: jax.Array) -> jax.Array:
-        cell = _beside(row, lookup(runs.cell, node))[side][k]
-        touches, other = runs.look(row, side, cell, node)
+    def describe(member: jax.Array) -> tuple[jax.Array, ...]:
+        bounds = take(upper, member)
+        return take(num_points, member), take(statistics.num_slab, member), -bounds[:, 3:6], bounds[:, :3]
 
-        def unite(_: jax.Array, parent: jax.Array) -> jax.Array:
-            ends = find_root(node, parent), find_root(other, parent)
-            low = jnp.minimum(*ends)
-            # The node itself, too, so that its way to the root is short.
-            return set_parent(set_parent(parent, jnp.maximum(*ends), low), node, low)
-
-        # A conditional would copy all parents.
-        return jax.lax.fori_loop(0, touches.astype(jnp.int32), unite, parent)
-
-    parent = jnp.arange(runs.cell.shape[0], dtype=jnp.int32)
-    for side in range(2):
-        for k in range(max(map(len, row.lines_back))):
-            parent = jax.lax.fori_loop(0, runs.num, functools.partial(join, side, k), parent)
-    return jax.lax.fori_loop(0, runs.num, lambda i, p: set_parent(p, i, find_root(i, p)), parent)
+    rows = map_rows(describe, member, num_rows=kept_up_to[-1])
+    return ChosenComponents(row, *rows, found=found, kept=jnp.stack(kept))
 
 
-def _join_in_rounds(row: CellRow, runs: _Runs) -> jax.Array:
-    """As `_join_one_by_one`, all links at once.
+def _find_clusters(
+    obstacles: Obstacles, component: jax.Array, row: jax.Array, fit_all: jax.Array, config: BoxConfig
+) -> tuple[jax.Array, jax.Array]:
+    """The cluster of each point on each map, and whether a rectangle is fitted to it.
 
-    The first kind of link makes a forest; its trees hook onto lower ones over the others.
+    Rectangles are fitted to points between the slab's heights, or to all of the clusters with few of those.
     """
-    itself = jnp.arange(runs.cell.shape[0], dtype=jnp.int32)
+    num_clusters = fit_all.shape[0]
+    # One look-up answers both.
+    code = 2 * row + take(fit_all, row).astype(jnp.int32)
 
-    def link(side: int, cell: jax.Array) -> jax.Array:
-        touches, other = runs.look(row, side, cell, itself)
-        return jnp.where(touches, other, itself)
+    def find(component: jax.Array, in_slab: jax.Array) -> tuple[jax.Array, jax.Array]:
+        found = lookup(code, component)
+        cluster, every = found >> 1, found & 1 == 1
+        return cluster, (cluster < num_clusters) & (in_slab | every)
 
-    sides = enumerate(_beside(row, runs.cell))
-    links = [link(side, cell) for side, cells in sides for cell in cells]
-    node, other = jnp.tile(itself, len(links)), jnp.concatenate(links)
-
-    def hook(parent: jax.Array) -> jax.Array:
-        pair = lookup(parent, node), lookup(parent, other)
-        return _jump(parent.at[jnp.maximum(*pair)].min(jnp.minimum(*pair)))
-
-    def hooks(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        parent, _ = state
-        for _ in range(HOOKS):
-            parent = hook(parent)
-        # A node's parent is of its component, and no greater. So where the ends of every link have the same
-        # parent, and each parent is its own, it is the component's lowest node.
-        agree = jnp.all(lookup(parent, node) == lookup(parent, other))
-        return parent, ~(agree & jnp.all(lookup(parent, parent) == parent))
-
-    # The first rounds without a look: for that the host would wait.
-    return jax.lax.while_loop(lambda state: state[1], hooks, hooks((_jump(links[0]), jnp.bool_(True))))[0]
+    return map_tables(
+        find,
+        component,
+        num_rows=obstacles.count,
+        init=(jnp.full(component.shape, num_clusters, jnp.int32), jnp.zeros(component.shape, bool)),
+        prepare=lambda height: _in_slab(height, config),
+        columns=obstacles.height,
+    )
 
 
-def _jump(parent: jax.Array) -> jax.Array:
-    """(C,) int32: up to 4^JUMPS steps towards the root of each node's tree."""
-    for _ in range(JUMPS):
-        higher = lookup(parent, lookup(parent, parent))
-        parent = lookup(parent, higher)
-    return parent
+def _in_slab(height: jax.Array, config: BoxConfig) -> jax.Array:
+    return (height > config.slab_min_height_m) & (height < config.slab_max_height_m)
+
+
+def _large_clusters(chosen: ChosenComponents, config: VehicleConfig) -> tuple[jax.Array, jax.Array]:
+    """Rows of the clusters that are high, stand on the ground and have many points; their true number."""
+    stands = chosen.low[:, 2] < config.large_clearance_m
+    enough = chosen.num_points.astype(jnp.float32) >= config.large_min_points
+    return compact((chosen.high[:, 2] > config.large_height_m) & stands & enough, config.max_large)

@@ -1,221 +1,266 @@
-"""Correction for occluded vehicles: hidden sides are completed by the class prior, away from the sensor."""
+"""Correction for occluded vehicles: hidden sides are completed by the class prior, as the evidence says."""
 
 import dataclasses
-import math
+import functools
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from jaxbox.types import NOT_A_BOX, Boxes, Rectangles
-from jaxbox.xla.loops import fast_max, fast_min, fold_points
+from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, VehicleConfig
+from jaxbox.stages._assignments import (
+    NUM_ASSIGNMENTS,
+    NUM_PLACEMENTS,
+    Assignments,
+    assign_length_axis,
+    extend,
+    extend_away,
+    fits,
+    keep_measured,
+    likely_sizes,
+    longer_side,
+    place,
+)
+from jaxbox.stages.state import (
+    NOT_A_BOX,
+    Boxes,
+    CastRays,
+    ClassHypotheses,
+    Clusters,
+    Completed,
+    RayFractions,
+    Rectangles,
+    longest_side,
+    prior_of,
+)
+from jaxbox.xla import chunks
+from jaxbox.xla.arithmetic import fast_max, fast_min
+from jaxbox.xla.loops import fold_rows, map_rows
+from jaxbox.xla.ragged import PointLists, fold_points
+from jaxbox.xla.rows import compact, first_argmax, split_index, take
+from jaxbox.xla.sorting import sort_by_group
 
 INSIDE_MARGIN_M = 0.1
 """A point this far outside a hypothesis still counts as inside."""
 
+
 NEAR_M = 0.1
 """A point nearer than this to a visible face counts as on it."""
+
 
 FACE_OVERHANG_M = 0.3
 """Faces reach this far beyond their corners when points are held against them."""
 
+
 FAR_M = 1e9
 """Farther away than any point."""
 
-NUM_PLACEMENTS = 3
-"""Where a completed width goes: away from the sensor, towards it, or both ways."""
 
-SEEN_RAMP = 0.05
-"""Fraction of the usual size over which a side goes from partly hidden to seen whole."""
-
-NUM_WAYS = 2
-"""Either side of a rectangle may be the length."""
-
-CERTAIN = 1e3
-"""Objective of a box that was not held against evidence: it passes any gate on the objective."""
+LOWER_PART_M = 0.5
+"""A cluster may be so much lower than its vehicle: the rest is another cluster, or outside the map."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Ways:
-    """Rectangles, each with one of its sides taken as the length."""
-
-    along: tuple[jax.Array, jax.Array]
-    """(...) m: where the length begins and ends, along the box and from the sensor."""
-    across: tuple[jax.Array, jax.Array]
-    """(...) m: the same of the width, across the box."""
-    yaw: jax.Array
-    """(...) rad, not wrapped."""
-    worth: jax.Array
-    """(...) of the rectangle."""
-
-    @property
-    def measured(self) -> tuple[jax.Array, jax.Array]:
-        """(...) m: length and width."""
-        return self.along[1] - self.along[0], self.across[1] - self.across[0]
-
-
-def way_to_lie(rectangle: Rectangles, side: jax.Array) -> Ways:
-    """Takes one side of each rectangle as its length.
+def complete_boxes(
+    candidates: Sequence[Rectangles],
+    points: PointLists,
+    clusters: Clusters,
+    cast_rays: CastRays | None,
+    config: DetectorConfig,
+) -> Completed:
+    """The completed box of every class hypothesis.
 
     Args:
-      rectangle: of any shape.
-      side: int32, broadcasts with them: 0 where the length is along u, 1 where it is along v.
+      candidates: rectangles (P,) of the clusters, one or two of each.
+      points: that those were fitted to.
+      clusters: of P rows.
+      cast_rays: asks the evidence; None where there is none.
+      config: of the detector.
 
     Returns:
-      Ways of the shape of both.
+      The hypotheses and their boxes.
     """
-    (u0, v0), (u1, v1) = (jnp.moveaxis(bounds, -1, 0) for bounds in (rectangle.low, rectangle.high))
-    along_v = side > 0
-    # With the length along v the frame turns by a quarter: across it lies -u.
-    return Ways(
-        along=(jnp.where(along_v, v0, u0), jnp.where(along_v, v1, u1)),
-        across=(jnp.where(along_v, -u1, v0), jnp.where(along_v, -u0, v1)),
-        yaw=jnp.where(along_v, rectangle.angle + math.pi / 2, rectangle.angle),
-        worth=jnp.broadcast_to(rectangle.worth, jnp.broadcast_shapes(rectangle.worth.shape, side.shape)),
+    hypotheses = list_hypotheses(clusters, candidates, config.vehicles)
+    if config.completion.mode == "evidence":
+        assert cast_rays is not None  # see check_config
+        boxes, num = _complete_by_evidence(hypotheses, candidates, points, cast_rays, config)
+        return Completed(hypotheses, boxes, num)
+
+    def complete(rows: tuple[jax.Array, jax.Array]) -> Boxes:
+        cluster, label = rows
+        prior = prior_of(config.vehicles.classes, label)
+        sides = longer_side(Rectangles(take(candidates[0].rows, cluster)))
+        if config.completion.mode == "none":
+            return keep_measured(sides, prior)
+        return extend_away(sides, prior, config.completion)
+
+    boxes = map_rows(complete, (hypotheses.cluster, hypotheses.label), num_rows=hypotheses.num)
+    return Completed(hypotheses, boxes, jnp.int32(0))
+
+
+def list_hypotheses(
+    clusters: Clusters, candidates: Sequence[Rectangles], config: VehicleConfig
+) -> ClassHypotheses:
+    """Lists the first class of all clusters, then the others of the large ones, without gaps.
+
+    Only those are listed that a gate would not refuse anyway.
+
+    Args:
+      clusters: of P rows.
+      candidates: rectangles (P,) of the clusters.
+      config: the classes.
+
+    Returns:
+      P + (classes - 1) max_large rows.
+    """
+    capacity, num_classes = clusters.num_points.shape[0], len(config.classes)
+    is_large = fold_rows(
+        lambda flags, _, row: flags.at[row].set(True, mode="drop"),
+        jnp.zeros(capacity, bool),
+        clusters.large,
+        num_rows=clusters.num_large,
+        absent=capacity,
     )
 
+    def may_be(rows: tuple[jax.Array, ...]) -> jax.Array:
+        is_large, high, *each = rows
+        rectangles = [Rectangles(rows) for rows in each]
+        sizes_fit = [_may_fit(prior, rectangles, config) for prior in config.classes]
+        tried = jnp.stack([sizes_fit[0], *(is_large & other for other in sizes_fit[1:])], axis=1)
+        return tried & _may_be_high_enough(high[:, 2], rectangles[0], config)[:, None]
 
-def fits(ways: Ways, max_length_m: jax.Array, max_width_m: jax.Array) -> jax.Array:
-    """(...) bool: whether the measured sides are no longer than those of the class."""
-    length, width = ways.measured
-    return (length <= max_length_m) & (width <= max_width_m)
+    rows = is_large, clusters.high, *(rectangles.rows for rectangles in candidates)
+    listed = map_rows(may_be, rows, num_rows=clusters.num).T
+    listed = listed & (jnp.arange(capacity, dtype=jnp.int32) < clusters.num)[None]
+    index, num = compact(listed.reshape(-1), capacity + (num_classes - 1) * clusters.large.shape[0])
+    label, cluster = split_index(index, capacity)
+    is_row = index < listed.size
+    return ClassHypotheses(jnp.where(is_row, cluster, capacity), jnp.where(is_row, label, 0), num)
 
 
-def likely_sizes(
-    ways: Ways,
-    length_m: jax.Array,
-    width_m: jax.Array,
-    *,
-    seen_length: jax.Array | float,
-    seen_width: jax.Array | float,
-    seen_weight: jax.Array | float,
-    length_margin_m: jax.Array | float,
-    width_margin_m: jax.Array | float,
+def _may_fit(prior: ClassPrior, candidates: Sequence[Rectangles], config: VehicleConfig) -> jax.Array:
+    """(P,) whether some rectangle of a cluster is no larger than a class, and not too small to tell."""
+    fits = jnp.zeros_like(candidates[0].angle, bool)
+    for rectangles in candidates:
+        long, short = longest_side(rectangles), jnp.min(rectangles.high - rectangles.low, axis=1)
+        small = (long <= prior.max_length_m) & (short <= prior.max_width_m)
+        fits = fits | (small & (long >= config.min_extent_m))
+    return fits
+
+
+def _may_be_high_enough(high: jax.Array, rectangles: Rectangles, config: VehicleConfig) -> jax.Array:
+    """(P,) whether a cluster can be (the lower part of) the lowest class, given the beams' spacing."""
+    rho = jnp.linalg.norm((rectangles.low + rectangles.high) / 2, axis=1)
+    lowest = functools.reduce(jnp.minimum, [prior.min_height_m for prior in config.classes])
+    return high + config.top_grade * rho > lowest - LOWER_PART_M
+
+
+def _complete_by_evidence(
+    hypotheses: ClassHypotheses,
+    candidates: Sequence[Rectangles],
+    points: PointLists,
+    cast_rays: CastRays,
+    config: DetectorConfig,
+) -> tuple[Boxes, jax.Array]:
+    """The box (Q,) of each hypothesis whose length axis and placement explain the evidence best.
+
+    And how many assignments the evidence had to weigh.
+    """
+    placement, objective, num = _judge_assignments(hypotheses, candidates, points, cast_rays, config)
+
+    def complete(of_hypothesis: tuple[jax.Array, ...]) -> Boxes:
+        cluster, label, placement, objective = of_hypothesis
+        best = jax.lax.argmax(objective, 1, jnp.int32)
+        placement, objective = (
+            jnp.take_along_axis(a, best[:, None], axis=1)[:, 0] for a in (placement, objective)
+        )
+        sides = _assign(candidates, best, cluster)
+        sizes = likely_sizes(sides, prior_of(config.vehicles.classes, label), config.completion)
+        return place(sides, sizes, placement, objective)
+
+    rows = hypotheses.cluster, hypotheses.label, placement, objective
+    return map_rows(complete, rows, num_rows=hypotheses.num), num
+
+
+def _assign(candidates: Sequence[Rectangles], number: jax.Array, cluster: jax.Array) -> Assignments:
+    """An assignment of each cluster, by its number: both of the first candidate, then of the second."""
+    which, side = split_index(number, NUM_ASSIGNMENTS)
+    rows = take(candidates[0].rows, cluster)
+    for i, rectangles in enumerate(candidates[1:], start=1):
+        rows = jnp.where(which[:, None] == i, take(rectangles.rows, cluster), rows)
+    return assign_length_axis(Rectangles(rows), side)
+
+
+def _judge_assignments(
+    hypotheses: ClassHypotheses,
+    candidates: Sequence[Rectangles],
+    points: PointLists,
+    cast_rays: CastRays,
+    config: DetectorConfig,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The best placement of each assignment of each hypothesis, and its J: (Q, W) each; their number."""
+    num_each = NUM_ASSIGNMENTS * len(candidates)
+    entry, num = _largest_first(hypotheses, candidates, points, config.vehicles)
+    num_entries, entry = entry.shape[0], entry[: config.completion.max_assignments]
+
+    def prepare(entry: jax.Array) -> tuple[Placements, jax.Array, jax.Array]:
+        hypothesis, number = split_index(entry, num_each)
+        cluster, label = take(hypotheses.cluster, hypothesis), take(hypotheses.label, hypothesis)
+        sides = _assign(candidates, number, cluster)
+        return place_widths(sides, prior_of(config.vehicles.classes, label)), sides.score, cluster
+
+    def judge(rows: tuple[Placements, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        boxes, score, cluster = rows
+        rays = cast_rays(boxes, num_rays=config.completion.num_rays)
+        agreement = point_agreement(boxes, *points.table(cluster), config.completion)
+        return choose_placement(score, agreement, rays, config.completion)
+
+    def note(tables: Any, _: jax.Array, rows: tuple[jax.Array, ...]) -> Any:
+        entry, *found = rows
+        return tuple(a.at[entry].set(value, mode="drop") for a, value in zip(tables, found, strict=True))
+
+    prepared = map_rows(prepare, entry, num_rows=num)
+    judged = map_rows(judge, prepared, num_rows=num, chunk=chunks.PROPOSALS)
+    nothing = jnp.zeros(num_entries, jnp.int32), jnp.full(num_entries, NOT_A_BOX, jnp.float32)
+    of_entry = fold_rows(note, nothing, (entry, *judged), num_rows=num, absent=(num_entries, 0, 0.0))
+    placement, objective = (a.reshape(-1, num_each) for a in of_entry)
+    return placement, objective, num
+
+
+def _largest_first(
+    hypotheses: ClassHypotheses, candidates: Sequence[Rectangles], points: PointLists, config: VehicleConfig
 ) -> tuple[jax.Array, jax.Array]:
-    """The class's size for sides that may be hidden in part; between it and the measured for the others.
+    """The possible assignments of all hypotheses, those of clusters with many points first; their number.
 
-    Args:
-      ways: of any shape.
-      length_m: (...) float32, m, of the class.
-      width_m: (...) float32, m, of the class.
-      seen_length: fraction of the class's length from which a side may be seen whole.
-      seen_width: the same of its width.
-      seen_weight: what the measured size of such a side weighs against the class's.
-      length_margin_m: measured lengths read short by this, m.
-      width_margin_m: measured widths read short by this, m.
-
-    Returns:
-      Length and width (...) float32, m, at least as measured.
-
-    Reference: oracle `jaxbox.reference.likely_size`.
+    A loop over the points of a chunk of them ends with the largest: so like sizes belong together.
     """
+    sides = [jnp.int32(side) for side in range(NUM_ASSIGNMENTS)]
 
-    def likely(
-        measured: jax.Array, usual: jax.Array, seen: jax.Array | float, margin_m: jax.Array | float
-    ) -> jax.Array:
-        whole = jnp.clip((measured / usual - seen) / SEEN_RAMP, 0, 1)
-        return jnp.maximum(usual + seen_weight * whole * (measured + margin_m - usual), measured)
+    def rank(rows: tuple[jax.Array, jax.Array]) -> jax.Array:
+        cluster, label = rows
+        first, *others = (Rectangles(take(rectangles.rows, cluster)) for rectangles in candidates)
+        prior = prior_of(config.classes, label)
+        # A second candidate at the angle of the first has nothing to add.
+        new = [jnp.ones_like(first.angle, bool), *(other.angle != first.angle for other in others)]
+        possible = [
+            is_new & fits(assign_length_axis(rectangle, side), prior)
+            for rectangle, is_new in zip((first, *others), new, strict=True)
+            for side in sides
+        ]
+        missing = points.max_points - jnp.minimum(take(points.total, cluster), points.max_points)
+        return jnp.where(jnp.stack(possible, axis=1), missing[:, None], points.max_points)
 
-    length, width = ways.measured
-    return (
-        likely(length, length_m, seen_length, length_margin_m),
-        likely(width, width_m, seen_width, width_margin_m),
-    )
-
-
-def _extend(side: tuple[jax.Array, jax.Array], size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Centres of an interval grown to `size`: away from the sensor, towards it, both ways."""
-    low, high = side
-    from_low, from_high = low + size / 2, high - size / 2
-    # The same as |low| < |high|, but right for a side without extent too: it grows away.
-    low_is_near = low + high > 0
-    away = jnp.where(low_is_near, from_low, from_high)
-    towards = jnp.where(low_is_near, from_high, from_low)
-    return away, towards, (low + high) / 2
-
-
-def longer_side(rectangle: Rectangles) -> Ways:
-    """Ways (P,) with the longer side as length."""
-    along_u, along_v = jnp.moveaxis(rectangle.high - rectangle.low, -1, 0)
-    return way_to_lie(rectangle, (along_v > along_u).astype(jnp.int32))
-
-
-def keep_measured(ways: Ways, *, max_length_m: jax.Array, max_width_m: jax.Array) -> Boxes:
-    """The rectangles as measured (the paper).
-
-    Args:
-      ways: of any shape.
-      max_length_m: (...) float32, m.
-      max_width_m: (...) float32, m.
-
-    Returns:
-      Boxes (...); no box where a measured side is too long.
-    """
-    certain = jnp.where(fits(ways, max_length_m, max_width_m), jnp.float32(CERTAIN), NOT_A_BOX)
-    return place(ways, ways.measured, jnp.zeros_like(certain, jnp.int32), certain)
-
-
-def extend_away(
-    ways: Ways,
-    length_m: jax.Array,
-    width_m: jax.Array,
-    *,
-    max_length_m: jax.Array,
-    max_width_m: jax.Array,
-    **sides: jax.Array | float,
-) -> Boxes:
-    """Completes both sides away from the sensor to their likely sizes.
-
-    The sensor sees the near ends of both sides; what is missing is behind them.
-
-    Args:
-      ways: of any shape.
-      length_m: (...) float32, m, of the class.
-      width_m: (...) float32, m, of the class.
-      max_length_m: (...) float32, m.
-      max_width_m: (...) float32, m.
-      **sides: the other arguments of `likely_sizes`.
-
-    Returns:
-      Boxes (...); no box where a measured side is too long.
-    """
-    certain = jnp.where(fits(ways, max_length_m, max_width_m), jnp.float32(CERTAIN), NOT_A_BOX)
-    sizes = likely_sizes(ways, length_m, width_m, **sides)
-    return place(ways, sizes, jnp.zeros_like(certain, jnp.int32), certain)
-
-
-def place(
-    ways: Ways, sizes: tuple[jax.Array, jax.Array], placement: jax.Array, objective: jax.Array
-) -> Boxes:
-    """Boxes of a size: the length away from the sensor, the width where `placement` says.
-
-    Args:
-      ways: of any shape.
-      sizes: length and width (...) float32, m, at least as measured.
-      placement: (...) int32, in [0, NUM_PLACEMENTS).
-      objective: (...) float32.
-
-    Returns:
-      Boxes (...).
-    """
-    u, across = _extend(ways.along, sizes[0])[0], _extend(ways.across, sizes[1])
-    v = jax.lax.select_n(placement, *across)
-    cos, sin = jnp.cos(ways.yaw), jnp.sin(ways.yaw)
-    return Boxes(
-        center=jnp.stack([cos * u - sin * v, sin * u + cos * v], axis=-1),
-        length=sizes[0],
-        width=sizes[1],
-        yaw=ways.yaw,
-        measured=jnp.stack(ways.measured, axis=-1),
-        objective=objective,
-    )
+    ranks = map_rows(rank, (hypotheses.cluster, hypotheses.label), num_rows=hypotheses.num)
+    num_entries = hypotheses.num * ranks.shape[1]
+    entry, begin, _ = sort_by_group(lambda i: i, ranks.reshape(-1), num_entries, points.max_points + 1)
+    # Clusters have points, so that only what is not possible comes last.
+    return entry, begin[points.max_points]
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Hypotheses:
-    """The vehicles that may hide behind each way: the width goes away from the sensor, towards it, or both
-    ways."""
+class Placements:
+    """What each assignment may be: the width goes away from the sensor, towards it, or both ways."""
 
     yaw: jax.Array
     """(C,) rad"""
@@ -236,47 +281,46 @@ class Hypotheses:
         return jnp.stack([cos * u - sin * v, sin * u + cos * v], axis=-1)
 
 
-def hypotheses(ways: Ways, length_m: jax.Array, width_m: jax.Array) -> Hypotheses:
+def place_widths(sides: Assignments, prior: ClassPrior) -> Placements:
     """Completes boxes to the class's size, or the measured where that is larger.
 
     Args:
-      ways: C of them.
-      length_m: (C,) float32, m, of the class.
-      width_m: (C,) float32, m, of the class.
+      sides: C of them.
+      prior: fields of (C,) float32.
 
     Returns:
-      The hypotheses: the length is completed away from the sensor.
+      The placements: the length is completed away from the sensor.
 
     Reference: oracle `jaxbox.reference.complete_box`.
     """
-    length, width = (jnp.maximum(a, b) for a, b in zip((length_m, width_m), ways.measured, strict=True))
-    return Hypotheses(
-        yaw=ways.yaw,
-        u=_extend(ways.along, length)[0],
-        v=jnp.stack(_extend(ways.across, width), axis=1),
+    length, width = (
+        jnp.maximum(a, b) for a, b in zip((prior.length_m, prior.width_m), sides.measured, strict=True)
+    )
+    return Placements(
+        yaw=sides.yaw,
+        u=extend(sides.along, length)[0],
+        v=jnp.stack(extend(sides.across, width), axis=1),
         length=length,
         width=width,
     )
 
 
 def point_agreement(
-    boxes: Hypotheses,
+    boxes: Placements,
     x: jax.Array,
     y: jax.Array,
     count: jax.Array,
-    *,
-    inside_weight: jax.Array | float,
-    near_weight: jax.Array | float,
+    config: CompletionConfig,
 ) -> jax.Array:
     """How well boxes hold the points they were made from, and how close these are to visible faces.
 
     Args:
-      boxes: C times three hypotheses.
+      boxes: C times three placements.
       x: (M, C) float32, m.
       y: (M, C) float32, m.
       count: (C,) int32, points of each.
-      inside_weight: of the fraction of the points inside the box, give or take 10 cm.
-      near_weight: of the mean of .1 / max(d, .1), d the distance to the nearest visible face.
+      config: weights of the fraction of the points inside the box, give or take 10 cm, and of the mean of
+        .1 / max(d, .1), d the distance to the nearest visible face.
 
     Returns:
       (3, C) float32: the weighted sum of both.
@@ -295,7 +339,7 @@ def point_agreement(
         to_u = jnp.where(out_v < FACE_OVERHANG_M, jnp.abs(u - face_u)[None], FAR_M)
         to_v = jnp.where(out_u < FACE_OVERHANG_M, jnp.abs(v - face_v), FAR_M)
         near = NEAR_M / fast_max(fast_min(to_u, to_v), NEAR_M)
-        return total + inside_weight * inside.astype(jnp.float32) + near_weight * near
+        return total + config.inside_weight * inside.astype(jnp.float32) + config.near_weight * near
 
     # Points that are absent are far from all boxes.
     total = fold_points(x, y, count, jnp.zeros_like(box_v), update, absent=(FAR_M, FAR_M))
@@ -303,40 +347,27 @@ def point_agreement(
 
 
 def choose_placement(
-    worth: jax.Array,
+    score: jax.Array,
     agreement: jax.Array,
-    *,
-    hit: jax.Array,
-    free: jax.Array,
-    free_length: jax.Array,
-    free_weight: jax.Array | float,
-    free_length_weight: jax.Array | float,
-    closeness_weight: jax.Array | float,
-    not_away_cost: jax.Array | float,
+    rays: RayFractions,
+    config: CompletionConfig,
 ) -> tuple[jax.Array, jax.Array]:
-    """The hypothesis of each way that explains the evidence best.
+    """The hypothesis of each assignment that explains the evidence best.
 
-    J = hit - wf free - wl free_length + agreement + wc worth - cost [width not away].
+    J = hit - wf free - wl free_length + agreement + wc score - cost [width not away].
 
     Args:
-      worth: (C,) float32, of the rectangle.
+      score: (C,) float32, of the rectangle.
       agreement: (3, C) float32, see `point_agreement`.
-      hit: (3, C) float32, fraction of rays.
-      free: (3, C) float32, fraction of rays.
-      free_length: (3, C) float32, fraction of the rays' length.
-      free_weight: wf.
-      free_length_weight: wl.
-      closeness_weight: wc.
-      not_away_cost: cost.
+      rays: (3, C) fractions.
+      config: wf, wl, wc and the cost.
 
     Returns:
       Its placement (C,) int32, the first of equally good ones, and its J (C,) float32.
     """
     number = jnp.arange(NUM_PLACEMENTS, dtype=jnp.int32)[:, None]
-    cost = not_away_cost * (number > 0).astype(jnp.float32)
-    objective = hit - free_weight * free - free_length_weight * free_length + agreement
-    objective = objective + closeness_weight * worth[None] - cost
-    best = jnp.max(objective, axis=0)
-    # An argmax does not vectorise (XLA, CPU).
-    placement = jnp.where(objective >= best[None], number, NUM_PLACEMENTS)
-    return jnp.min(placement, axis=0), best
+    cost = config.not_away_cost * (number > 0).astype(jnp.float32)
+    objective = rays.hit - config.free_weight * rays.free - config.free_length_weight * rays.free_length
+    objective = objective + agreement
+    objective = objective + config.closeness_weight * score[None] - cost
+    return first_argmax(objective)

@@ -3,12 +3,35 @@
 import jax
 import jax.numpy as jnp
 
-from jaxbox.types import Descriptors
-from jaxbox.xla.loops import fold_rows
-from jaxbox.xla.masked import take
+from jaxbox.stages.state import Kept, Owners
+from jaxbox.types import Descriptors, Hulls
+from jaxbox.xla.loops import fold_rows, map_rows
+from jaxbox.xla.rows import take
 
 MIN_VARIANCE = 1e-6
 """m^2: points on a line have a minor axis of a millimetre rather than none."""
+
+
+def describe(
+    owners: Owners, xy: jax.Array, kept: Kept, hulls: Hulls, hull_area: jax.Array
+) -> tuple[jax.Array, Descriptors]:
+    """How many points each detection has, and their shape.
+
+    Args:
+      owners: the points of K detections.
+      xy: (O, 2) float32, m, of the obstacles.
+      kept: the detections.
+      hulls: of those points.
+      hull_area: (K,) float32, m^2.
+
+    Returns:
+      num_points: (K,) int32.
+      descriptors: of K detections.
+    """
+    moments = point_moments(owners.owner, owners.row, owners.num, xy, kept.center[:, :2])
+    shape, every = (moments, hull_area, hulls.num_vertices), jnp.int32(kept.valid.shape[0])
+    shapes = map_rows(lambda rows: shape_descriptors(*rows), shape, num_rows=every)
+    return moments[:, 0].astype(jnp.int32), shapes
 
 
 def point_moments(
@@ -52,21 +75,21 @@ def shape_descriptors(moments: jax.Array, hull_area: jax.Array, num_vertices: ja
       num_vertices: (K,) int32.
 
     Returns:
-      The descriptors; 1 for the eccentricity, and 0 else, of an empty cluster.
+      The descriptors; 1 for the eccentricity, and 0 for all else, of an empty cluster.
 
     Reference: paper, sections 3.5 and 4.4; oracle `jaxbox.reference.shape_descriptors`.
     """
     count = moments[:, 0]
     x, y, xx, yy, xy = (moments[:, 1:] / jnp.maximum(count, 1)[:, None]).T
     major, minor = _eigenvalues(xx - x * x, yy - y * y, xy - x * y)
-    present = count > 0
+    has_points = count > 0
     ratio = jnp.maximum(major, MIN_VARIANCE) / jnp.maximum(minor, MIN_VARIANCE)
-    has_area = present & (hull_area > 0)
+    has_area = has_points & (hull_area > 0)
     return Descriptors(
         moment_of_inertia=jnp.stack([major, minor], axis=1),
         eccentricity=jnp.sqrt(ratio),
         density=jnp.where(has_area, count / jnp.where(has_area, hull_area, 1), 0),
-        complexity=jnp.where(present, num_vertices.astype(jnp.float32) / jnp.maximum(count, 1), 0),
+        complexity=jnp.where(has_points, num_vertices.astype(jnp.float32) / jnp.maximum(count, 1), 0),
     )
 
 

@@ -1,6 +1,5 @@
-"""Rectangles by trying all rotations (paper, section 3.4, Algorithm III), and the scene direction."""
+"""Rectangles by trying all rotations (paper, section 3.4, Algorithm III)."""
 
-import dataclasses
 import math
 from collections.abc import Callable
 
@@ -8,125 +7,84 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox.types import Rectangles
-from jaxbox.xla.backend import on_accelerator
-from jaxbox.xla.loops import fast_max, fast_min, fold_points, fold_rows, map_rows, store
-from jaxbox.xla.masked import rows_in_use, take
-from jaxbox.xla.sorting import sort_by_group
+from jaxbox.config import BoxConfig, DetectorConfig
+from jaxbox.stages.state import Outlines, Rectangles, Rotations
+from jaxbox.xla import chunks
+from jaxbox.xla.arithmetic import fast_max, fast_min
+from jaxbox.xla.loops import map_rows
+from jaxbox.xla.ragged import PointLists, PointTable, fold_points
+from jaxbox.xla.rows import first_argmax
+from jaxbox.xla.sorting import largest_first
 
-CHUNK = 64
-"""Clusters at a time: their extents at all rotations stay in the cache."""
-
-VOTE_CHUNK = 64
-"""Votes at a time: few boxes of a sweep vote."""
-
-VOTE_POINTS, VOTE_EXTENT_M = 150.0, 6.0
-"""A vote for the scene direction counts min(points, 150) x min(extent, 6 m)."""
+PREFERENCE_GAIN = 5.0
+"""How often the scene's direction counts for the second candidate of a cluster: it bends a closeness only."""
 
 FAR_M = 1e12
 """Farther away than any point."""
 
-PointTable = tuple[jax.Array, jax.Array, jax.Array]
-"""x and y of points (M, C) m, and how many of them count (C,)."""
 
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class PointLists:
-    """The points of each cluster, one list after the other."""
-
-    x: jax.Array
-    """(E,) float32, m."""
-    y: jax.Array
-    """(E,) float32, m."""
-    start: jax.Array
-    """(K,) int32, where the points of each cluster begin."""
-    total: jax.Array
-    """(K,) int32, how many they are."""
-    max_points: int = dataclasses.field(metadata={"static": True})
-    """static, M: so many of a cluster are looked at."""
-
-    @property
-    def count(self) -> jax.Array:
-        """(K,) int32, points of each cluster that are looked at."""
-        return jnp.minimum(self.total, self.max_points)
-
-    def table(self, cluster: jax.Array) -> PointTable:
-        """The points of some clusters, spread evenly over all they have: every (total / M)-th.
-
-        Args:
-          cluster: (C,) int32, in [0, K]; the latter has none.
-
-        Returns:
-          The points, in their order; those beyond the count may be anything finite.
-        """
-        start, total = take(self.start, cluster), take(self.total, cluster)
-        index = jnp.arange(self.max_points, dtype=jnp.int32)
-        if on_accelerator():
-            # Cluster by cluster, as the points lie in the lists and as `fold_points` reads them there.
-            row = self._row(start[:, None], total[:, None], index[None])
-            xy = jnp.take(jnp.stack([self.x, self.y], axis=1), row, axis=0, mode="clip")
-            x, y = xy[:, :, 0].T, xy[:, :, 1].T
-        else:
-            # Stored, since what a look-up has to work out first does not vectorise.
-            row = store(self._row(start[None], total[None], index[:, None]))
-            x, y = (jnp.take(values, row, mode="clip") for values in (self.x, self.y))
-        return x, y, jnp.minimum(total, self.max_points)
-
-    def _row(self, start: jax.Array, total: jax.Array, j: jax.Array) -> jax.Array:
-        """The row of the j-th point that is looked at of each cluster."""
-        spread = j * (total // self.max_points) + j * (total % self.max_points) // self.max_points
-        return start + jnp.where(total > self.max_points, spread, j)
-
-
-def list_points(
-    cluster: jax.Array,
-    row: jax.Array,
-    num_entries: jax.Array,
-    xy: jax.Array,
-    *,
-    num_clusters: int,
-    max_points: int,
-) -> PointLists:
-    """Lists the points of each cluster.
+def fit_rectangles(outlines: Outlines, num_clusters: jax.Array, config: BoxConfig) -> Rotations:
+    """Rectangles of all clusters at all rotations.
 
     Args:
-      cluster: (E,) int32, in [0, num_clusters).
-      row: (E,) int32, of the point in `xy`.
-      num_entries: () int32; only the first so many entries count.
-      xy: (N, 2) float32, m.
-      num_clusters: static, K.
-      max_points: static, M.
+      outlines: the points of P clusters.
+      num_clusters: () int32, how many count.
+      config: criterion and rotations.
 
     Returns:
-      The lists, each in the order of its entries.
+      The rectangles, of the clusters with most points first.
+    """
+    points = outlines.points
+    order, place = largest_first(points.count, points.max_points)
+    curve, extents = try_rotations(points, order, num_clusters, config)
+    return Rotations(curve, extents, place)
+
+
+def choose_rectangles(
+    rotations: Rotations, num_clusters: jax.Array, preference: jax.Array, *, gain: float = 1.0
+) -> Rectangles:
+    """The rectangle of each cluster at its best rotation, see `best_rectangles`.
+
+    Args:
+      rotations: of P clusters.
+      num_clusters: () int32, how many count.
+      preference: (A,) float32, added to every curve.
+      gain: how often the preference counts when the rotation is chosen; the score counts it once.
+
+    Returns:
+      (P,) rectangles.
     """
 
-    def read(i: jax.Array) -> tuple[jax.Array, jax.Array]:
-        x, y = (values.at[row[i]].get(mode="promise_in_bounds") for values in columns)
-        return x, y
+    def best(rotations: tuple[jax.Array, jax.Array]) -> jax.Array:
+        return best_rectangles(*rotations, preference, gain=gain).rows.T
 
-    def read_pair(i: jax.Array) -> jax.Array:
-        return jnp.take(xy, row[i], axis=0, mode="clip")
+    columns = rotations.curve, rotations.extents
+    rows = map_rows(best, columns, num_rows=num_clusters, chunk=chunks.PROPOSALS, axis=-1)
+    return Rectangles(rows.T[rotations.place])
 
-    columns = xy[:, 0], xy[:, 1]
-    if on_accelerator():
-        # In pairs, as `PointLists.table` looks them up.
-        pairs, begin, end = sort_by_group(read_pair, cluster, num_entries, num_clusters)
-        x, y = pairs[:, 0], pairs[:, 1]
-    else:
-        (x, y), begin, end = sort_by_group(read, cluster, num_entries, num_clusters)
-    return PointLists(x, y, begin, end - begin, max_points)
+
+def rectangle_candidates(
+    rotations: Rotations, num_clusters: jax.Array, preference: jax.Array, config: DetectorConfig
+) -> list[Rectangles]:
+    """The rectangles of each cluster that the evidence is to choose from.
+
+    Args:
+      rotations: of P clusters.
+      num_clusters: () int32, how many count.
+      preference: (A,) float32, for the scene's direction.
+      config: of the detector.
+
+    Returns:
+      That at the best rotation, and, where the preset asks, that along the scene's direction.
+    """
+    gains = [1.0]
+    if config.box.scene_direction and config.completion.along_scene:
+        gains.append(PREFERENCE_GAIN)
+    return [choose_rectangles(rotations, num_clusters, preference, gain=gain) for gain in gains]
 
 
 def try_rotations(
-    points: PointLists,
-    cluster: jax.Array,
-    num_clusters: jax.Array,
-    *,
-    criterion: str,
-    num_angles: int,
-    min_distance_m: jax.Array | float,
+    points: PointLists, cluster: jax.Array, num_clusters: jax.Array, config: BoxConfig
 ) -> tuple[jax.Array, jax.Array]:
     """Bounds each cluster by a rectangle at every rotation, and rates them (larger is better).
 
@@ -139,9 +97,7 @@ def try_rotations(
       points: of the clusters.
       cluster: (P,) int32, the clusters to bound. Those of like size best lie side by side.
       num_clusters: () int32, how many of them count.
-      criterion: static, one of the above.
-      num_angles: static, A; rotations by i * 90 / A degrees.
-      min_distance_m: d0, m.
+      config: one of the criteria above; A rotations by i * 90 / A degrees; d0 is `min_distance_m`.
 
     Returns:
       curve: (A, P) float32.
@@ -149,15 +105,16 @@ def try_rotations(
 
     Reference: paper, Algorithm III; oracles `jaxbox.reference.criterion_curve`, cv2.minAreaRect.
     """
+    num_angles = config.num_angles
     angle = (np.arange(num_angles) * (math.pi / 2 / num_angles))[:, None]
     cos, sin = jnp.asarray(np.cos(angle), jnp.float32), jnp.asarray(np.sin(angle), jnp.float32)
 
     def rate(cluster: jax.Array) -> tuple[jax.Array, jax.Array]:
         clusters = points.table(cluster)
         extents = _extents(clusters, cos, sin)
-        return _CRITERIA[criterion](clusters, cos, sin, extents, min_distance_m), extents
+        return _CRITERIA[config.criterion](clusters, cos, sin, extents, config.min_distance_m), extents
 
-    return map_rows(rate, cluster, num_rows=num_clusters, chunk=CHUNK, axis=-1)
+    return map_rows(rate, cluster, num_rows=num_clusters, chunk=chunks.ROTATIONS, axis=-1)
 
 
 def _extents(clusters: PointTable, cos: jax.Array, sin: jax.Array) -> jax.Array:
@@ -251,9 +208,9 @@ def _variance(
 
     def update(state: tuple[jax.Array, ...], x: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
         du, dv = _to_edge(_along(x, y, cos, sin), u0, u1), _to_edge(_along(x, y, minus_sin, cos), v0, v1)
-        there = (jnp.abs(x) < FAR_M / 2)[None]
-        along_u = there & (du < dv)
-        along_v = there & ~along_u
+        is_point = (jnp.abs(x) < FAR_M / 2)[None]
+        along_u = is_point & (du < dv)
+        along_v = is_point & ~along_u
         nu, su, ssu, nv, sv, ssv = state
         du, dv = jnp.where(along_u, du, 0), jnp.where(along_v, dv, 0)
         num_u, num_v = along_u.astype(jnp.float32), along_v.astype(jnp.float32)
@@ -279,7 +236,7 @@ _CRITERIA = {
 
 
 def best_rectangles(
-    curve: jax.Array, extents: jax.Array, preference: jax.Array, *, insistence: float = 1.0
+    curve: jax.Array, extents: jax.Array, preference: jax.Array, *, gain: float = 1.0
 ) -> Rectangles:
     """The rectangle at each cluster's best rotation.
 
@@ -287,62 +244,15 @@ def best_rectangles(
       curve: (A, P) float32, see `try_rotations`.
       extents: (4, A, P) float32, m, likewise.
       preference: (A,) float32, added to every curve.
-      insistence: how often the preference counts when the rotation is chosen; its worth counts it once.
+      gain: how often the preference counts when the rotation is chosen; the score counts it once.
 
     Returns:
       The rectangles; of equally good rotations the first.
     """
     num_angles = curve.shape[0]
-    total = curve + (insistence * preference)[:, None]
-    # An argmax does not vectorise; a minimum of integers takes several kernels, one of floats one (XLA, CPU).
-    is_best = total >= jnp.max(total, axis=0)[None]
-    angle = jnp.arange(num_angles, dtype=jnp.float32)[:, None]
-    best = jnp.min(jnp.where(is_best, angle, num_angles - 1), axis=0).astype(jnp.int32)
+    total = curve + (gain * preference)[:, None]
+    best, _ = first_argmax(total)
     u0, u1, v0, v1 = jnp.take_along_axis(extents, best[None, None], axis=1)[:, 0]
-    worth = jnp.take_along_axis(curve, best[None], axis=0)[0]
+    score = jnp.take_along_axis(curve, best[None], axis=0)[0]
     angle = best.astype(jnp.float32) * (math.pi / 2 / num_angles)
-    return Rectangles(jnp.stack([u0, v0, u1, v1, angle, worth + preference[best]], axis=1))
-
-
-def scene_preference(
-    yaw: jax.Array,
-    extent: jax.Array,
-    num_points: jax.Array,
-    voting: jax.Array,
-    *,
-    num_angles: int,
-    weight: jax.Array | float,
-    sigma_deg: jax.Array | float,
-) -> jax.Array:
-    """Prefers the direction that most boxes share: vehicles stand along or across one road.
-
-    Args:
-      yaw: (K,) float32, rad, of the voting boxes.
-      extent: (K,) float32, m, the longest measured extent of each.
-      num_points: (K,) int32.
-      voting: (K,) bool.
-      num_angles: static, A.
-      weight: height of the preference.
-      sigma_deg: width of a vote, and of the preference, exp(-(d / sigma)^2).
-
-    Returns:
-      (A,) float32, to be added to the curves; zero where no box votes.
-
-    Reference: oracle `jaxbox.reference.scene_direction`.
-    """
-    bins = jnp.arange(num_angles, dtype=jnp.float32) * (90.0 / num_angles)
-
-    def closeness(angle_deg: jax.Array) -> jax.Array:
-        difference = (bins[None] - angle_deg[:, None] % 90 + 45) % 90 - 45
-        return jnp.exp(-((difference / sigma_deg) ** 2))
-
-    def add(votes: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
-        yaw, power = rows
-        return votes + power @ closeness(jnp.rad2deg(yaw))
-
-    power = jnp.minimum(num_points.astype(jnp.float32), VOTE_POINTS) * jnp.minimum(extent, VOTE_EXTENT_M)
-    ballots = yaw, jnp.where(voting, power, 0)
-    votes = jnp.zeros(num_angles, jnp.float32)
-    votes = fold_rows(add, votes, ballots, num_rows=rows_in_use(voting), chunk=VOTE_CHUNK, absent=(0.0, 0.0))
-    direction = bins[jax.lax.argmax(votes, 0, jnp.int32)]
-    return jnp.where(jnp.max(votes) > 0, weight * closeness(direction[None])[0], 0)
+    return Rectangles(jnp.stack([u0, v0, u1, v1, angle, score + preference[best]], axis=1))

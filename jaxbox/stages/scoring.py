@@ -1,61 +1,66 @@
-"""Vehicle decision: what surrounds a box, its score, and suppression of overlapping boxes."""
+"""Vehicle decision: the score of a box, what surrounds it, and non-maximum suppression."""
 
 import dataclasses
-import functools
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
-from jaxbox.geometry.planar import rectangle_iou
-from jaxbox.xla.backend import on_accelerator
-from jaxbox.xla.loops import for_chunks, map_rows
-from jaxbox.xla.masked import WORD_BITS, count, prefix_max, prefix_sum, split_index
-from jaxbox.xla.sorting import sort_by_group
+from jaxbox.config import ClassPrior, DetectorConfig, RegionConfig, VehicleConfig
+from jaxbox.geometry.planar import rectangle_iou, wrap_yaw
+from jaxbox.stages.state import (
+    NOT_A_BOX,
+    Boxes,
+    Candidates,
+    Clusters,
+    Completed,
+    HeightAboveGround,
+    Kept,
+    Obstacles,
+    RayFractions,
+    prior_of,
+)
+from jaxbox.xla import chunks
+from jaxbox.xla.loops import map_rows
+from jaxbox.xla.rows import compact, sum_after, take
+from jaxbox.xla.runs import count_kinds, fold_runs, maximum_nonnegative
+from jaxbox.xla.sorting import best_first, select_highest, sort_by_group
+from jaxbox.xla.suppression import suppress_conflicts
 
 NEARBY_CELL_M = 1.0
 """Points are looked up by cells of this size."""
 
+
 MAX_CELL_ROWS = 24
 """Rows of cells round a box: a vehicle of 18 m, the longest that passes the gates, with its ring."""
 
-BLOCK_POINTS = 32
-"""Neighbouring points are looked at in blocks of so many."""
-
-LOOKUP_BLOCKS, LOOKUP_BLOCKS_AT_ONCE = 1024, 8192
-"""Blocks looked at in one go, on a CPU and on an accelerator."""
-
-COUNT_BITS = BLOCK_POINTS.bit_length()
-"""Bits that hold a count of the points of a block."""
 
 NUM_KINDS = 5
-"""Kinds of points that are counted, and counts in a word of the bits of all."""
+"""Kinds of points that are counted, see `NeighbourhoodCounts`."""
+
 
 NUM_LEVELS = 20
 """Levels of height in which the points inside are counted, up to the highest that a vehicle's may have."""
 
+
 LOWEST_LEVEL = 0.4
 """Where the levels begin, as a share of that height: no vehicle's top is lower."""
 
-DOUBT_POINTS = 5
-"""So many upper points, with the share of full worth behind the faces, are taken for granted: of few
+
+PSEUDO_COUNT = 5
+"""Pseudo-count: so many upper points, with the share of the full score behind the faces, are added, as of few
 points the share says little."""
 
-ROUNDS = 6
-"""Rounds of suppression on an accelerator before the host looks whether they were enough."""
 
-BOX_CHUNK = 128
-"""Boxes looked at together."""
-
-OVERLAP_TILE = WORD_BITS
-"""Rows and columns of the overlap matrix at a time: a word of bits each row."""
+INSIDE_TOLERANCE_M = 1e-3
+"""A point on the face of its box is inside."""
 
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
-class Surroundings:
+class NeighbourhoodCounts:
     """Points in and round each box."""
 
     rows: jax.Array
@@ -92,56 +97,186 @@ class Surroundings:
         return self.rows[:, 5]
 
 
+def score_boxes(
+    completed: Completed,
+    rays: tuple[RayFractions, jax.Array] | None,
+    clusters: Clusters,
+    obstacles: Obstacles,
+    height_above_ground: HeightAboveGround,
+    config: DetectorConfig,
+) -> Candidates:
+    """Scores the boxes by rays and size, then the best of them by what surrounds them.
+
+    Args:
+      completed: Q boxes.
+      rays: what the rays over each box met, and the ground support round it; None without evidence.
+      clusters: of P rows.
+      obstacles: all points above the ground.
+      height_above_ground: asks for heights.
+      config: of the detector.
+
+    Returns:
+      The boxes with a score, best first.
+    """
+    hypotheses, boxes, settings = completed.hypotheses, completed.boxes, config.vehicles
+    score = _early_scores(completed, rays, clusters, settings)
+    chosen, num = select_highest(score, settings.max_candidates, settings.min_score)
+
+    def pick(chosen: jax.Array) -> tuple[jax.Array, ...]:
+        box = jax.tree.map(lambda a: take(a, chosen), boxes)
+        size = jnp.stack([box.length, box.width, wrap_yaw(box.yaw)], axis=1)
+        rectangle = jnp.concatenate([box.center, size], axis=1)
+        of_hypothesis = take(hypotheses.label, chosen), take(hypotheses.cluster, chosen)
+        return rectangle, *of_hypothesis, take(score, chosen)
+
+    picked = map_rows(pick, chosen, num_rows=num)
+    rectangle, label, cluster, _ = picked
+    around = _look_around(rectangle, label, cluster, num, clusters, obstacles, config)
+
+    def finish(rows: tuple[Any, ...]) -> Candidates:
+        return _finish(rows, clusters, height_above_ground, settings)
+
+    candidates = map_rows(finish, (*picked, around), num_rows=num)
+    order = best_first(candidates.score, num)
+    ordered = map_rows(lambda row: jax.tree.map(lambda a: take(a, row), candidates), order, num_rows=num)
+    return dataclasses.replace(ordered, num=num)
+
+
+def _early_scores(
+    completed: Completed,
+    rays: tuple[RayFractions, jax.Array] | None,
+    clusters: Clusters,
+    config: VehicleConfig,
+) -> jax.Array:
+    """(Q,) the part of the score that needs no look at the surroundings; no other part exceeds 1."""
+    hypotheses = completed.hypotheses
+
+    def score(rows: tuple[Boxes, jax.Array, jax.Array, tuple[RayFractions, jax.Array] | None]) -> jax.Array:
+        boxes, label, cluster, rays = rows
+        ones = jnp.ones_like(boxes.yaw)
+        hit, free_length, support = ones, 0 * ones, config.support_points * ones
+        if rays is not None:
+            hit, free_length, support = rays[0].hit, rays[0].free_length, rays[1]
+        num_points = take(clusters.num_points, cluster)
+        by_evidence = evidence_score(num_points, hit, free_length, support, boxes.objective, config)
+        prior = prior_of(config.classes, label)
+        by_size = size_score(jnp.stack([boxes.length, boxes.width], axis=1), prior)
+        score = by_evidence * by_size * prior.prior_weight
+        large_enough = jnp.max(boxes.measured, axis=1) >= config.min_extent_m
+        return jnp.where((boxes.objective > NOT_A_BOX) & large_enough, score, 0)
+
+    rows = completed.boxes, hypotheses.label, hypotheses.cluster, rays
+    scores = map_rows(score, rows, num_rows=hypotheses.num)
+    return jnp.where(jnp.arange(scores.shape[0], dtype=jnp.int32) < hypotheses.num, scores, 0)
+
+
+def _look_around(
+    rectangle: jax.Array,
+    label: jax.Array,
+    cluster: jax.Array,
+    num: jax.Array,
+    clusters: Clusters,
+    obstacles: Obstacles,
+    config: DetectorConfig,
+) -> NeighbourhoodCounts:
+    """What there is in and round each box: its cluster alone where the preset does not look round."""
+    if not config.vehicles.neighbourhood:
+        num_points = take(clusters.num_points, cluster).astype(jnp.float32)
+        return cluster_alone(num_points, take(clusters.high[:, 2], cluster))
+    prior = prior_of(config.vehicles.classes, label)
+    return count_points_around(rectangle, prior, num, obstacles, config.vehicles, config.region)
+
+
+def _finish(
+    rows: tuple[Any, ...],
+    clusters: Clusters,
+    height_above_ground: HeightAboveGround,
+    config: VehicleConfig,
+) -> Candidates:
+    """Candidates with their score and height, in the order that they came in."""
+    rectangle, label, cluster, score, around = rows
+    prior = prior_of(config.classes, label)
+    late = neighbourhood_score(around, jnp.linalg.norm(rectangle[:, :2], axis=1), prior, config)
+    height = jnp.maximum(around.top + config.top_margin_m, prior.min_box_height_m)
+    above = jnp.zeros_like(height)
+    if not config.neighbourhood:
+        # The paper keeps the height of the cluster itself.
+        above = take(clusters.low[:, 2], cluster)
+        height = take(clusters.high[:, 2], cluster) - above
+    at_sensor_height = jnp.concatenate([rectangle[:, :2], jnp.zeros_like(rectangle[:, :1])], axis=1)
+    bottom = above - height_above_ground(at_sensor_height)
+    total = score * late
+    total = jnp.where(total > config.min_score, total, 0)
+    return Candidates(rectangle, bottom, height, total, label, cluster, total > 0, jnp.zeros_like(label))
+
+
+def keep_best(candidates: Candidates, config: VehicleConfig) -> Kept:
+    """The candidates that overlap no better one.
+
+    Args:
+      candidates: C rows, best score first.
+      config: the overlap, and the capacity K.
+
+    Returns:
+      K rows; the lowest-scoring beyond the capacity are left out, and counted.
+    """
+    keep = non_max_suppression(candidates.rectangle, candidates.valid, max_overlap=config.max_overlap)
+    row, num = compact(keep, config.max_detections)
+
+    def pick(row: jax.Array) -> tuple[jax.Array, ...]:
+        x, y, length, width, yaw = take(candidates.rectangle, row).T
+        bottom, height = take(candidates.bottom, row), take(candidates.height, row)
+        half_length, half_width = length / 2 + INSIDE_TOLERANCE_M, width / 2 + INSIDE_TOLERANCE_M
+        return (
+            jnp.stack([x, y, bottom + height / 2], axis=1),
+            jnp.stack([length, width, height], axis=1),
+            yaw,
+            take(candidates.score, row),
+            take(candidates.label, row),
+            take(candidates.cluster, row),
+            jnp.stack([x, y, jnp.cos(yaw), jnp.sin(yaw), half_length, half_width], axis=1),
+        )
+
+    return Kept(*map_rows(pick, row, num_rows=num), valid=row < keep.shape[0], num=num)
+
+
 def count_points_around(
     boxes: jax.Array,
-    count_max_height_m: jax.Array,
-    recess_m: jax.Array,
+    prior: ClassPrior,
     num_boxes: jax.Array,
-    xy: jax.Array,
-    height: jax.Array,
-    num_points: jax.Array,
-    *,
-    half_x_m: float,
-    half_y_m: float,
-    margin_m: jax.Array | float,
-    ring_m: jax.Array | float,
-    upper_height_m: jax.Array | float,
-    stray_share: jax.Array | float,
-) -> Surroundings:
+    obstacles: Obstacles,
+    config: VehicleConfig,
+    region: RegionConfig,
+) -> NeighbourhoodCounts:
     """Counts the points of the whole sweep in and round each box.
 
     Args:
       boxes: (P, 5) float32: x, y, length, width (m), yaw (rad).
-      count_max_height_m: (P,) float32, m: points lower than this belong to the vehicle.
-      recess_m: (P,) float32, m: how far behind the faces that the sensor sees a point counts as recessed.
+      prior: fields of (P,) float32: points lower than `count_max_height_m` belong to the vehicle, and
+        those farther than `recess_m` behind the faces that the sensor sees are recessed.
       num_boxes: () int32, rows that hold a box.
-      xy: (N, 2) float32, m, all obstacle points.
-      height: (N,) float32, m, above the ground.
-      num_points: () int32, rows that hold a point.
-      half_x_m: static, points lie within |x| below it.
-      half_y_m: static, points lie within |y| below it.
-      margin_m: a point this far outside still counts as inside, m.
-      ring_m: a point farther out than the margin and nearer than this is in the ring, m.
-      upper_height_m: points higher than this are glass, bonnet and roof, m.
-      stray_share: share of the points inside that may lie above the top: a single return in the air is no
-        roof. 0 makes the highest point the top.
+      obstacles: all points above the ground.
+      config: margin, ring, and what upper points and strays are. A `top_quantile` of 0 makes the highest
+        point the top.
+      region: that the points lie in.
 
     Returns:
       The counts; zero for chunks of boxes beyond `num_boxes`.
 
     Reference: oracle `jaxbox.reference.count_points_around`.
     """
-    shape = (math.ceil(2 * half_x_m / NEARBY_CELL_M), math.ceil(2 * half_y_m / NEARBY_CELL_M))
+    halves_m, xy, ring_m = (region.half_x_m, region.half_y_m), obstacles.xy, config.ring_m
+    shape = [math.ceil(2 * half_m / NEARBY_CELL_M) for half_m in halves_m]
 
     def cell(position: jax.Array, axis: int) -> jax.Array:
-        index = jnp.floor((position + (half_x_m, half_y_m)[axis]) / NEARBY_CELL_M)
+        index = jnp.floor((position + halves_m[axis]) / NEARBY_CELL_M)
         return jnp.clip(index, 0, shape[axis] - 1).astype(jnp.int32)
 
     cell_of_point = cell(xy[:, 0], 0) * shape[1] + cell(xy[:, 1], 1)
     order, begin, end = sort_by_group(
-        lambda i: i, cell_of_point, num_points, shape[0] * shape[1], room=BLOCK_POINTS
+        lambda i: i, cell_of_point, obstacles.count, shape[0] * shape[1], room=chunks.RUN_ROWS
     )
-    points = [jnp.take(values, order, mode="clip") for values in (xy[:, 0], xy[:, 1], height)]
+    points = [jnp.take(values, order, mode="clip") for values in (xy[:, 0], xy[:, 1], obstacles.height)]
 
     def prepare(rows: tuple[jax.Array, ...]) -> tuple[jax.Array, list[jax.Array], list[jax.Array]]:
         boxes, *others = rows
@@ -157,16 +292,16 @@ def count_points_around(
         row = jnp.minimum(i, shape[0] - 1) * shape[1]
         first, after = begin[row + low[1][:, None]], end[row + high[1][:, None]]
         length = jnp.where(i <= high[0][:, None], after - first, 0)
-        counts, highest = _count_runs(frames, first, length, points, margin_m, ring_m, upper_height_m)
+        counts, highest = _count_runs(frames, first, length, points, config)
         inside, above, ring, upper, recessed = counts[:, :NUM_KINDS].T
-        top = _top(highest, stray_share * inside, counts[:, NUM_KINDS:], frames[:, -1])
+        top = _top(highest, config.top_quantile * inside, counts[:, NUM_KINDS:], frames[:, -1])
         return jnp.stack([inside, top, above, ring, upper, recessed], axis=1)
 
-    rows = map_rows(prepare, (boxes, count_max_height_m, recess_m), num_rows=num_boxes)
-    return Surroundings(map_rows(look, rows, num_rows=num_boxes, chunk=BOX_CHUNK))
+    rows = map_rows(prepare, (boxes, prior.count_max_height_m, prior.recess_m), num_rows=num_boxes)
+    return NeighbourhoodCounts(map_rows(look, rows, num_rows=num_boxes, chunk=chunks.BOXES))
 
 
-def cluster_alone(num_points: jax.Array, top: jax.Array) -> Surroundings:
+def cluster_alone(num_points: jax.Array, top: jax.Array) -> NeighbourhoodCounts:
     """What surrounds boxes of which only the clusters are looked at: nothing.
 
     Args:
@@ -174,10 +309,10 @@ def cluster_alone(num_points: jax.Array, top: jax.Array) -> Surroundings:
       top: (P,) float32, m above the ground, of the clusters.
 
     Returns:
-      The surroundings.
+      The counts.
     """
     none = jnp.zeros_like(top)
-    return Surroundings(jnp.stack([num_points, top, none, none, none, none], axis=1))
+    return NeighbourhoodCounts(jnp.stack([num_points, top, none, none, none, none], axis=1))
 
 
 def _frames(boxes: jax.Array, count_max_height_m: jax.Array, recess_m: jax.Array) -> jax.Array:
@@ -198,98 +333,52 @@ def _count_runs(
     first: jax.Array,
     length: jax.Array,
     points: Sequence[jax.Array],
-    margin_m: jax.Array | float,
-    ring_m: jax.Array | float,
-    upper_height_m: jax.Array | float,
+    config: VehicleConfig,
 ) -> tuple[jax.Array, jax.Array]:
-    """Counts over runs of neighbouring points, some for each box, (C, runs): block after block of them.
+    """Counts over runs of neighbouring points, some for each box, (C, runs).
 
     Returns:
       counts: (C, kinds + levels) float32.
       highest: (C,) float32, m.
     """
-    num_boxes, runs = first.shape
-    first, length = first.reshape(-1), length.reshape(-1)
-    at_once = LOOKUP_BLOCKS_AT_ONCE if on_accelerator() else LOOKUP_BLOCKS
-    num_blocks = (length + BLOCK_POINTS - 1) // BLOCK_POINTS
-    end = prefix_sum(num_blocks)
-    begin = end - num_blocks
 
-    def step(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        # The run of each block: that which begins last, before it or with it.
-        place = start.astype(jnp.int32) + jnp.arange(at_once, dtype=jnp.int32)
-        present = (num_blocks > 0) & (end > place[0]) & (begin <= place[-1])
-        at = jnp.where(present, jnp.maximum(begin - place[0], 0), at_once)
-        run = jnp.zeros(at_once, jnp.int32).at[at].max(jnp.arange(end.shape[0], dtype=jnp.int32), mode="drop")
-        run = prefix_max(run)
-        offset = (place - begin[run]) * BLOCK_POINTS
-        left = jnp.where(place < end[-1], length[run] - offset, 0)
-        box, _ = split_index(run, runs)
+    def update(
+        state: tuple[jax.Array, jax.Array], box: jax.Array, valid: jax.Array, columns: list[jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
+        counts, highest = _judge(frames[box], valid, columns, config)
+        return state[0].at[box].add(counts), state[1].at[box].max(highest)
 
-        def block(column: jax.Array) -> jax.Array:
-            def piece(start: jax.Array) -> jax.Array:
-                return jax.lax.dynamic_slice_in_dim(column, start, BLOCK_POINTS)
-
-            return jax.vmap(piece)(first[run] + offset)
-
-        there = jnp.arange(BLOCK_POINTS, dtype=jnp.int32)[None] < left[:, None]
-        words, highest = _judge(
-            frames[box], there, [block(column) for column in points], margin_m, ring_m, upper_height_m
-        )
-        digit = jnp.arange(NUM_KINDS, dtype=jnp.int32)[None, None]
-        counts = (words[:, :, None] >> digit * COUNT_BITS) & (2**COUNT_BITS - 1)
-        return state[0].at[box].add(counts.reshape(at_once, -1)), state[1].at[box].max(highest)
-
+    num_boxes = first.shape[0]
     none = jnp.zeros((num_boxes, NUM_KINDS + NUM_LEVELS), jnp.int32), jnp.zeros(num_boxes, jnp.float32)
-    counts, highest = for_chunks(end[-1], at_once, step, none)
+    counts, highest = fold_runs(update, none, first, length, points)
     return counts.astype(jnp.float32), highest
 
 
 def _judge(
-    frames: jax.Array,
-    there: jax.Array,
-    points: Sequence[jax.Array],
-    margin_m: jax.Array | float,
-    ring_m: jax.Array | float,
-    upper_height_m: jax.Array | float,
+    frames: jax.Array, valid: jax.Array, points: Sequence[jax.Array], config: VehicleConfig
 ) -> tuple[jax.Array, jax.Array]:
-    """Counts of points in blocks (B, L) of them, packed in words (B, W), and the highest inside (B,).
-
-    The first word holds each kind of point, and the others each level of height of those inside.
-    """
+    """Counts of each kind and level of points in blocks (B, L) of them, and the highest inside (B,)."""
     box_x, box_y, cos, sin, half_l, half_w, facing_u, facing_v, face_u, face_v, max_height = (
         frames[:, k, None] for k in range(frames.shape[1])
     )
     x, y, height = points
     dx, dy = x - box_x, y - box_y
     u, v = dx * cos + dy * sin, dy * cos - dx * sin
-    out = jnp.where(there, jnp.maximum(jnp.abs(u) - half_l, jnp.abs(v) - half_w), jnp.inf)
-    inside, low = out < margin_m, height < max_height
-    upper = inside & low & (height > upper_height_m)
+    out = jnp.where(valid, jnp.maximum(jnp.abs(u) - half_l, jnp.abs(v) - half_w), jnp.inf)
+    inside, low = out < config.margin_m, height < max_height
+    upper = inside & low & (height > config.upper_height_m)
     recessed = upper & (jnp.minimum(face_u - facing_u * u, face_v - facing_v * v) > 0)
-    # One sum counts all kinds, each in its own bits.
-    kinds = (inside & low, inside & ~low, ~inside & (out < ring_m) & low, upper, recessed)
-    digits = [jnp.where(kind, jnp.int32(1 << k * COUNT_BITS), 0) for k, kind in enumerate(kinds)]
-    first = functools.reduce(jnp.add, digits)
+    kinds = (inside & low, inside & ~low, ~inside & (out < config.ring_m) & low, upper, recessed)
     share = height / max_height - LOWEST_LEVEL
     level = jnp.minimum(share * (NUM_LEVELS / (1 - LOWEST_LEVEL)), NUM_LEVELS - 1).astype(jnp.int32)
     level = jnp.where(inside & low & (share > 0), level, NUM_LEVELS)
-    place, digit = split_index(level, NUM_KINDS)
-    word = jnp.arange(NUM_LEVELS // NUM_KINDS, dtype=jnp.int32)[:, None, None]
-    others = jnp.where(place[None] == word, 1 << digit * COUNT_BITS, 0)
-    # Heights are not negative, and the bits of such numbers are in their order: integers' maxima vectorise.
-    highest = jax.lax.bitcast_convert_type(jnp.where(inside & low, height, 0), jnp.int32)
-    sums = jnp.sum(first, axis=1, dtype=jnp.int32), jnp.sum(others, axis=2, dtype=jnp.int32)
-    counts = jnp.concatenate([sums[0][:, None], sums[1].T], axis=1)
-    return counts, jax.lax.bitcast_convert_type(jnp.max(highest, axis=1), jnp.float32)
+    counts = count_kinds(kinds, level, NUM_LEVELS)
+    return counts, maximum_nonnegative(jnp.where(inside & low, height, 0))
 
 
 def _top(highest: jax.Array, num_stray: jax.Array, levels: jax.Array, max_height: jax.Array) -> jax.Array:
     """(P,) the height that so many points exceed, evenly spread within their level (P, levels)."""
-    # A product is one kernel, a cumulative sum several (XLA, CPU). It is exact of whole numbers, unless
-    # an accelerator rounds them first.
-    beyond = np.tri(NUM_LEVELS, k=-1, dtype=np.float32)
-    higher = jnp.dot(levels, beyond, precision=jax.lax.Precision.HIGHEST)
+    higher = sum_after(levels)
     num_stray = num_stray[:, None]
     is_top = (higher <= num_stray) & (num_stray < higher + levels)
     above = jnp.arange(NUM_LEVELS, 0, -1, dtype=jnp.float32)[None] - 1
@@ -298,7 +387,7 @@ def _top(highest: jax.Array, num_stray: jax.Array, levels: jax.Array, max_height
     return jnp.where(jnp.any(is_top, axis=1), jnp.minimum(share * max_height, highest), highest)
 
 
-def bell(
+def asymmetric_gaussian(
     value: jax.Array, peak: jax.Array | float, below: jax.Array | float, above: jax.Array | float
 ) -> jax.Array:
     """exp(-((value - peak) / width)^2), with its own width on either side.
@@ -316,18 +405,12 @@ def bell(
 
 
 def evidence_score(
-    *,
     num_points: jax.Array,
     hit: jax.Array,
     free_length: jax.Array,
     support: jax.Array,
     objective: jax.Array,
-    saturation_points: jax.Array | float,
-    sparseness_power: jax.Array | float,
-    free_scale: jax.Array | float,
-    support_points: jax.Array | float,
-    objective_gate: jax.Array | float,
-    objective_softness: jax.Array | float,
+    config: VehicleConfig,
 ) -> jax.Array:
     """The part of the score that the rays and the cluster decide.
 
@@ -337,60 +420,36 @@ def evidence_score(
       free_length: (P,) float32, fraction of the rays' length.
       support: (P,) float32, ground points round the box.
       objective: (P,) float32, J of the box.
-      saturation_points: full worth from so many points.
-      sparseness_power: below, (points / saturation)^power.
-      free_scale: exp(-(free_length / scale)^2).
-      support_points: full worth from so many ground points.
-      objective_gate: 1 / (1 + exp(-(J - gate) / softness)).
-      objective_softness: of the gate.
+      config: (points / saturation)^power, exp(-(free_length / scale)^2), full score from so many ground
+        points, and 1 / (1 + exp(-(J - gate) / softness)).
 
     Returns:
       (P,) float32 in [0, 1].
     """
-    dense = jnp.minimum(num_points.astype(jnp.float32) / saturation_points, 1) ** sparseness_power
-    grounded = jnp.minimum((support + 0.5) / support_points, 1)
-    gate = jax.nn.sigmoid((objective - objective_gate) / objective_softness)
-    return dense * jnp.exp(-((free_length / free_scale) ** 2)) * hit * grounded * gate
+    dense = jnp.minimum(num_points.astype(jnp.float32) / config.saturation_points, 1)
+    dense = dense**config.sparseness_power
+    grounded = jnp.minimum((support + 0.5) / config.support_points, 1)
+    gate = jax.nn.sigmoid((objective - config.objective_gate) / config.objective_softness)
+    return dense * jnp.exp(-((free_length / config.free_scale) ** 2)) * hit * grounded * gate
 
 
-def size_score(
-    size: jax.Array,
-    prior: jax.Array,
-    *,
-    length_below_m: jax.Array,
-    length_above_m: jax.Array,
-    width_tolerance_m: jax.Array,
-) -> jax.Array:
+def size_score(size: jax.Array, prior: ClassPrior) -> jax.Array:
     """How well the box's length and width match the class.
 
     Args:
       size: (P, 2) float32, m: length, width.
-      prior: (P, 2) float32, m, of the class.
-      length_below_m: (P,) float32, m, width of the length's bell below the prior.
-      length_above_m: (P,) float32, m, above the prior.
-      width_tolerance_m: (P,) float32, m.
+      prior: fields of (P,) float32.
 
     Returns:
       (P,) float32 in [0, 1].
     """
-    length = bell(size[:, 0], prior[:, 0], length_below_m, length_above_m)
-    return length * bell(size[:, 1], prior[:, 1], width_tolerance_m, width_tolerance_m)
+    length = asymmetric_gaussian(size[:, 0], prior.length_m, prior.length_below_m, prior.length_above_m)
+    tolerance_m = prior.width_tolerance_m
+    return length * asymmetric_gaussian(size[:, 1], prior.width_m, tolerance_m, tolerance_m)
 
 
-def surroundings_score(
-    around: Surroundings,
-    rho: jax.Array,
-    *,
-    height_m: jax.Array,
-    height_below_m: jax.Array,
-    height_above_m: jax.Array,
-    min_height_m: jax.Array,
-    max_height_m: jax.Array,
-    top_grade: jax.Array | float,
-    ring_weight: jax.Array | float,
-    overhead_weight: jax.Array | float,
-    recess_share: jax.Array | float,
-    upright_worth: jax.Array | float,
+def neighbourhood_score(
+    around: NeighbourhoodCounts, rho: jax.Array, prior: ClassPrior, config: VehicleConfig
 ) -> jax.Array:
     """The part of the score that the points in and round the box decide.
 
@@ -400,33 +459,30 @@ def surroundings_score(
     Args:
       around: see `count_points_around`.
       rho: (P,) float32, m, range of the box.
-      height_m: (P,) float32, m, the prior.
-      height_below_m: (P,) float32, m, width of the height's bell below the prior.
-      height_above_m: (P,) float32, m, above the prior.
-      min_height_m: (P,) float32, m: lower tops are no such vehicle.
-      max_height_m: (P,) float32, m: higher tops are no such vehicle.
-      top_grade: how much higher than the points the top may be, m per m of range.
-      ring_weight: exp(-weight ring / inside).
-      overhead_weight: exp(-weight above / inside).
-      recess_share: full worth from this share of the upper points behind the faces on.
-      upright_worth: worth where there is none; boxes with few upper points come near to full worth.
+      prior: fields of (P,) float32.
+      config: exp(-(ring weight x ring + overhead weight x above) / inside), and what upright boxes lose:
+        those with few upper points come near to the full score.
 
     Returns:
       (P,) float32 in [0, 1]; 0 where a gate fails.
     """
-    highest = around.top + top_grade * rho
-    plausible = (highest > min_height_m) & (around.top < max_height_m)
-    top = jnp.clip(height_m, around.top, highest)
-    clutter = (ring_weight * around.num_ring + overhead_weight * around.num_above) / jnp.maximum(
-        around.num_inside, 1
+    highest = around.top + config.top_grade * rho
+    plausible = (highest > prior.min_height_m) & (around.top < prior.max_height_m)
+    top = jnp.clip(prior.height_m, around.top, highest)
+    clutter = (config.ring_weight * around.num_ring + config.overhead_weight * around.num_above) / (
+        jnp.maximum(around.num_inside, 1)
     )
-    score = bell(top, height_m, height_below_m, height_above_m) * jnp.exp(-clutter)
-    recessed = (around.num_recessed + DOUBT_POINTS * recess_share) / (around.num_upper + DOUBT_POINTS)
-    worth = upright_worth + (1 - upright_worth) * jnp.minimum(recessed / recess_share, 1)
-    return jnp.where(plausible, score * worth, 0)
+    score = asymmetric_gaussian(top, prior.height_m, prior.height_below_m, prior.height_above_m)
+    score = score * jnp.exp(-clutter)
+    recessed = around.num_recessed + PSEUDO_COUNT * config.recess_share
+    recessed = recessed / (around.num_upper + PSEUDO_COUNT)
+    upright = config.upright_score + (1 - config.upright_score) * jnp.minimum(
+        recessed / config.recess_share, 1
+    )
+    return jnp.where(plausible, score * upright, 0)
 
 
-def suppress(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | float) -> jax.Array:
+def non_max_suppression(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | float) -> jax.Array:
     """Keeps each box that overlaps no better one that is kept (greedy non-maximum suppression).
 
     Args:
@@ -437,63 +493,6 @@ def suppress(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | flo
     Returns:
       (P,) bool.
 
-    Reference: oracle `jaxbox.reference.suppress`.
+    Reference: oracle `jaxbox.reference.non_max_suppression`.
     """
-    if on_accelerator():
-        return _suppress_at_once(boxes, valid, max_overlap)
-    rivals = _overlaps(boxes, count(valid), max_overlap)[: valid.shape[0]]
-
-    def without_rivals(keep: jax.Array) -> jax.Array:
-        return valid & ~jnp.any((rivals & keep[None]) != 0, axis=1)
-
-    def step(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        _, keep = state
-        return keep, _pack(without_rivals(keep))
-
-    # A box depends on better ones only: after k rounds the first k are right, and where nothing changes all
-    # are. A few rounds do: chains of boxes that overlap one after the other are short.
-    every = _pack(valid)
-    init = jnp.zeros_like(every), every
-    return without_rivals(jax.lax.while_loop(lambda s: jnp.any(s[0] != s[1]), step, init)[1])
-
-
-def _suppress_at_once(boxes: jax.Array, valid: jax.Array, max_overlap: jax.Array | float) -> jax.Array:
-    """As `suppress`, all pairs at once, and some rounds before the host looks whether they were enough."""
-    row = jnp.arange(valid.shape[0], dtype=jnp.int32)
-    iou = jax.vmap(jax.vmap(rectangle_iou, (None, 0)), (0, None))(boxes, boxes)
-    rivals = (iou > max_overlap) & (row[None] < row[:, None])
-
-    def step(keep: jax.Array) -> jax.Array:
-        return valid & ~jnp.any(rivals & keep[None], axis=1)
-
-    def rounds(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        before_last = functools.reduce(lambda keep, _: step(keep), range(ROUNDS - 1), state[1])
-        return before_last, step(before_last)
-
-    return jax.lax.while_loop(lambda s: jnp.any(s[0] != s[1]), rounds, rounds((valid, valid)))[1]
-
-
-def _overlaps(boxes: jax.Array, num_boxes: jax.Array, max_overlap: jax.Array | float) -> jax.Array:
-    """(P, P / 32) uint32: which better boxes each one overlaps, as bits."""
-    boxes = jnp.pad(boxes, ((0, -boxes.shape[0] % OVERLAP_TILE), (0, 0)))
-    row = jnp.arange(OVERLAP_TILE, dtype=jnp.uint32)
-
-    def tile(i: jax.Array, j: jax.Array, bits: jax.Array) -> jax.Array:
-        first, second = (jax.lax.dynamic_slice_in_dim(boxes, k, OVERLAP_TILE) for k in (i, j))
-        iou = jax.vmap(jax.vmap(rectangle_iou, (None, 0)), (0, None))(first, second)
-        better = j + row[None] < i + row[:, None]
-        return jax.lax.dynamic_update_slice(bits, _pack((iou > max_overlap) & better), (i, j // OVERLAP_TILE))
-
-    def tiles(i: jax.Array, bits: jax.Array) -> jax.Array:
-        return for_chunks(i + 1, OVERLAP_TILE, functools.partial(tile, i), bits)
-
-    bits = jnp.zeros((boxes.shape[0], boxes.shape[0] // OVERLAP_TILE), jnp.uint32)
-    return for_chunks(num_boxes, OVERLAP_TILE, tiles, bits)
-
-
-def _pack(flags: jax.Array) -> jax.Array:
-    """Truth values along the last axis as the bits of words."""
-    flags = jnp.pad(flags, [(0, 0)] * (flags.ndim - 1) + [(0, -flags.shape[-1] % WORD_BITS)])
-    bits = flags.reshape(*flags.shape[:-1], -1, WORD_BITS)
-    values = jnp.uint32(1) << jnp.arange(WORD_BITS, dtype=jnp.uint32)
-    return jnp.sum(jnp.where(bits, values, jnp.uint32(0)), axis=-1, dtype=jnp.uint32)
+    return suppress_conflicts(boxes, valid, lambda a, b: rectangle_iou(a, b) > max_overlap)

@@ -10,9 +10,9 @@ import numpy as np
 from jaxbox._padding import fitting_capacity
 from jaxbox.config import DetectorConfig
 from jaxbox.config.fields import replace_settings
-from jaxbox.detector import detect
 from jaxbox.evaluation.copies import Copy, Frame, detect_copy
 from jaxbox.evaluation.objectives import Matched, Objective
+from jaxbox.run.compiled import detect
 from jaxbox.tuning.selection import Trial, score_without
 from jaxbox.tuning.space import Changes
 from jaxbox.types import PointCloud, Status

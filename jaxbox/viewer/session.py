@@ -7,7 +7,7 @@ from typing import Any
 import jax
 
 from jaxbox.config import DetectorConfig
-from jaxbox.detector import count_compilations, detect
+from jaxbox.run.compiled import count_compilations, detect
 from jaxbox.types import Detections
 from jaxbox.viewer.frames import Frame, Frames
 

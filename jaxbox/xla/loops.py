@@ -1,93 +1,14 @@
-"""Loops over rows and points at a fixed shape, and walls between what XLA would else work out twice."""
+"""Loops at a fixed shape over the rows that count."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from jaxbox.xla.backend import on_accelerator
-
-AT_ONCE = 62
-"""Numbers that `at_once` may copy: what reads and writes more than a kilobyte is no small loop to XLA."""
-
-FOLD_UNROLL = 4
-"""Points folded in one step of the loop over them, on a CPU."""
-
-
-def store(values: Any) -> Any:
-    """Has values computed once and stored, where the compiler would compute them in every reader.
-
-    XLA fuses a producer into each of its consumers. A loop is a wall that fusion does not cross, even one of
-    no turn: barriers keep the compiler from seeing that it has none, and that a turn would change nothing.
-    (A conditional would copy what goes through it.) There are no walls on an accelerator, whose host would
-    wait at each.
-
-    Args:
-      values: pytree of arrays.
-
-    Returns:
-      The values.
-    """
-    if on_accelerator():
-        return values
-    never = jax.lax.optimization_barrier(jnp.bool_(False))
-
-    def turn(state: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
-        return jax.lax.optimization_barrier(state)
-
-    return jax.lax.while_loop(lambda state: state[0], turn, (never, values))[1]
-
-
-def apart(function: Callable[..., Any], *operands: Any) -> Any:
-    """Calls a function in a room of its own: its scratch memory lives while it runs, and no longer.
-
-    XLA makes constants, such as the zeros that a scatter starts from, as early as it can: those of a long
-    program would all be there from its start, beside the scratch of whatever comes first. What is inside a
-    conditional is made when it is needed, and stored. On an accelerator the function is simply called.
-
-    Args:
-      function: of the operands.
-      *operands: whatever it takes.
-
-    Returns:
-      The function's result.
-    """
-    if on_accelerator():
-        return function(*operands)
-    function = jax.jit(function, inline=True)  # Traced once, for both branches.
-    always = jax.lax.optimization_barrier(jnp.bool_(True))
-    return jax.lax.cond(always, lambda: function(*operands), lambda: _zeros_of(function, *operands))
-
-
-def at_once(function: Callable[..., Any], *operands: Any) -> Any:
-    """Computes a few dozen numbers in one kernel, where each would have its own.
-
-    XLA compiles so small a loop, here of one turn, to native code on the CPU, see `AT_ONCE`. On an
-    accelerator the function is simply called.
-
-    Args:
-      function: of the operands.
-      *operands: whatever it takes.
-
-    Returns:
-      The function's result.
-    """
-    if on_accelerator():
-        return function(*operands)
-    function = jax.jit(function, inline=True)  # Traced once, for its shapes and for the loop.
-    once = jax.lax.optimization_barrier(jnp.bool_(True))
-
-    def turn(_: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
-        return jnp.bool_(False), function(*operands)
-
-    return jax.lax.while_loop(lambda state: state[0], turn, (once, _zeros_of(function, *operands)))[1]
-
-
-def _zeros_of(function: Callable[..., Any], *operands: Any) -> Any:
-    """Zeros in the shapes of a function's result."""
-    return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, *operands))
+from jaxbox.xla.barriers import materialize
 
 
 def for_chunks(
@@ -232,81 +153,59 @@ def fold_rows(
     return for_chunks(num_rows, chunk, step, state)
 
 
-def fold_points(
-    x: jax.Array,
-    y: jax.Array,
-    count: jax.Array,
-    init: Any,
-    update: Callable[[Any, jax.Array, jax.Array], Any],
-    *,
-    absent: tuple[Any, Any],
-    reduce: Callable[..., jax.Array] = jnp.sum,
-) -> Any:
-    """Sums up the points of many clusters, or finds what is greatest among them.
-
-    On an accelerator it is what each point makes of the first state, reduced over the points. A CPU folds a
-    few points of each cluster at a time into a wide state, with the clusters along the last axis: so all
-    arithmetic vectorises, which a reduction over an inner axis does not (XLA, CPU), and the loop ends with
-    the largest cluster of the batch.
+def map_batches(function: Callable[[jax.Array], jax.Array], rows: jax.Array, *, chunk: int) -> jax.Array:
+    """Applies a function to all rows, a chunk at a time on a CPU. Law: `jax.vmap(function)(rows)`.
 
     Args:
-      x: (M, C) float32.
-      y: (M, C) float32.
-      count: (C,) int32, points of each cluster.
-      init: pytree of (..., C) arrays, the state before the first point.
-      update: maps the state and x (C,), y (C,) to the next state.
-      absent: x and y, () or (C,) each, of the points that a cluster does not have, for a CPU: such that
-        `update` makes nothing of them.
-      reduce: static, `jnp.sum` or `jnp.max`, whichever `update` does, and `init` the neutral state of it.
+      function: of one row.
+      rows: (P, ...).
+      chunk: static, rows at a time.
 
     Returns:
-      The state after the last point of each cluster.
+      (P, ...).
     """
-    capacity = x.shape[0]
     if on_accelerator():
-        # Points along the last axis, which reductions read without transposing, see `PointLists.table`.
-        of_point = jax.vmap(functools.partial(update, init), out_axes=-1)(x, y)
-        exists = jnp.arange(capacity, dtype=jnp.int32)[None] < count[:, None]
-        return jax.tree.map(
-            lambda values, none: reduce(jnp.where(exists, values, none[..., None]), axis=-1), of_point, init
-        )
-
-    there, unroll = jnp.arange(capacity, dtype=jnp.int32)[:, None] < count[None], FOLD_UNROLL
-
-    def fill(values: jax.Array, value: Any) -> jax.Array:
-        filled = jnp.where(there, values, value)
-        more = jnp.broadcast_to(jnp.asarray(value, values.dtype), (-capacity % unroll, values.shape[1]))
-        return jnp.concatenate([filled, more])
-
-    filled = fill(x, absent[0]), fill(y, absent[1])
-    most = jnp.minimum(jnp.max(count, initial=0), capacity)
-
-    def step(loop: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
-        first, state = loop
-        # A point by its own index: a slice of several is ten times slower (XLA, CPU).
-        for k in range(unroll):
-            state = update(state, filled[0][first + k], filled[1][first + k])
-        return first + unroll, state
-
-    return jax.lax.while_loop(lambda loop: loop[0] < most, step, (jnp.int32(0), init))[1]
+        return jax.vmap(function)(rows)
+    return jax.lax.map(function, rows, batch_size=chunk)
 
 
-def fast_max(a: Any, b: Any) -> jax.Array:
-    """The greater of two numbers, neither of which is NaN.
+def repeat(function: Callable[[Any], Any], state: Any, times: int) -> Any:
+    """Applies a function again and again. Law: ``f(f(... f(state)))``.
 
-    `jnp.maximum` hands NaN on, for which XLA takes five instructions on a CPU instead of one: this is for
-    loops that do little else.
+    Args:
+      function: of the state.
+      state: pytree of arrays.
+      times: static.
 
-    >>> fast_max(jnp.array([1, 3]), 2).tolist()
-    [2, 3]
+    Returns:
+      The last state.
     """
-    return jnp.where(a > b, a, b)
+    if on_accelerator():
+        return functools.reduce(lambda state, _: function(state), range(times), state)
+    return jax.lax.scan(lambda state, _: (function(state), None), state, length=times)[0]
 
 
-def fast_min(a: Any, b: Any) -> jax.Array:
-    """The lesser of two numbers, neither of which is NaN; see `fast_max`.
+def apply_in_turn(functions: Sequence[Callable[[Any], Any]], state: Any) -> Any:
+    """Applies functions one after the other. Law: ``functions[-1](... functions[0](state))``.
 
-    >>> fast_min(jnp.array([1, 3]), 2).tolist()
-    [1, 2]
+    Each result is materialized, or the compiler would compute each cell again for every reader of the next.
+
+    Args:
+      functions: of the state.
+      state: pytree of arrays.
+
+    Returns:
+      The last state.
     """
-    return jnp.where(a < b, a, b)
+    return functools.reduce(lambda state, function: materialize(function(state)), functions, state)
+
+
+def fast_axis() -> int:
+    """The axis of a table (items, rows) or (rows, items) along which sums over the items are fast.
+
+    Sums along the first axis vectorise on a CPU; on an accelerator those along the last are the faster ones.
+
+    Returns:
+      0 for a CPU, 1 for an accelerator.
+    """
+    return 1 if on_accelerator() else 0

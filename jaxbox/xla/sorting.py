@@ -1,4 +1,4 @@
-"""Points by group, at a fixed shape: sorted by the number of their cell or cluster."""
+"""Rows by group and by score, at a fixed shape."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,9 +6,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
-from jaxbox.xla.loops import store
-from jaxbox.xla.masked import WORD_BITS, prefix_sum
+from jaxbox.xla.barriers import materialize
+from jaxbox.xla.bits import WORD_BITS
+from jaxbox.xla.loops import for_chunks
+from jaxbox.xla.rows import compact, prefix_sum
 
 
 def largest_first(size: jax.Array, max_size: int) -> tuple[jax.Array, jax.Array]:
@@ -55,18 +58,18 @@ def sort_by_group(
     """
     size = group.shape[0]
     num_rows = jnp.minimum(num_rows, size)
-    group = store(jnp.where(jnp.arange(size, dtype=jnp.int32) < num_rows, group, num_groups))
+    group = materialize(jnp.where(jnp.arange(size, dtype=jnp.int32) < num_rows, group, num_groups))
     count = jnp.zeros(num_groups, jnp.int32).at[group].add(1, mode="drop")
     end = prefix_sum(count)
 
     if on_accelerator():
         values = _place_sorted(read, group, num_groups, room)
     else:
-        values = _place_one_by_one(read, group, num_rows, end - count, room)
+        values = _place_sequential(read, group, num_rows, end - count, room)
     return values, end - count, end
 
 
-def _place_one_by_one(
+def _place_sequential(
     read: Callable[[jax.Array], Any], group: jax.Array, num_rows: jax.Array, begin: jax.Array, room: int
 ) -> Any:
     """Counting sort: XLA compiles so small a loop to native code on the CPU."""
@@ -98,3 +101,72 @@ def _stable_order(group: jax.Array, num_groups: int) -> jax.Array:
     # One packed word sorts several times faster than a key with its value.
     packed = jax.lax.sort((group.astype(jnp.uint32) << index_bits) | index, is_stable=False)
     return (packed & (2**index_bits - 1)).astype(jnp.int32)
+
+
+def select_highest(
+    score: jax.Array, capacity: int, min_score: jax.Array | float
+) -> tuple[jax.Array, jax.Array]:
+    """Rows with scores above a threshold. Law: in their order, and where they are too many the highest.
+
+    Args:
+      score: (P,) float32, no NaN.
+      capacity: static.
+      min_score: () float32.
+
+    Returns:
+      row: (capacity,) int32, ascending, P beyond; of equal scores at the end the first rows.
+      num: () int32, the true number.
+    """
+    above = score > min_score
+    if on_accelerator():
+        above_and_high = above & (_num_better(score) < capacity)
+        return compact(above_and_high, capacity)[0], jnp.sum(above, dtype=jnp.int32)
+    row, num = compact(above, capacity)
+
+    def highest() -> jax.Array:
+        row = jnp.arange(score.shape[0], dtype=jnp.int32)
+        _, order = jax.lax.sort((-score, row), num_keys=1, is_stable=True)
+        return jnp.sort(order[:capacity])
+
+    if capacity >= score.shape[0]:
+        return row, num
+    return jax.lax.cond(num > capacity, highest, lambda: row), num
+
+
+def _num_better(score: jax.Array) -> jax.Array:
+    """(P,) int32: how many rows have a higher score, or the same and come before."""
+    row = jnp.arange(score.shape[0], dtype=jnp.int32)
+    comes_first = (score[None] == score[:, None]) & (row[None] < row[:, None])
+    better = (score[None] > score[:, None]) | comes_first
+    return jnp.sum(better, axis=1, dtype=jnp.int32)
+
+
+def best_first(score: jax.Array, num: jax.Array) -> jax.Array:
+    """Rows with positive scores by descending score. Law: a stable sort of them.
+
+    The place of a row is the number of rows before it: for the few that are there, counting beats a sort.
+
+    Args:
+      score: (P,) float32, no NaN.
+      num: () int32; rows beyond the first so many score nothing.
+
+    Returns:
+      (P,) int32 rows, P beyond the last.
+    """
+    size = score.shape[0]
+    row = jnp.arange(size, dtype=jnp.int32)
+    padded = jnp.pad(score, (0, -size % chunks.RANKS))
+
+    def step(start: jax.Array, place: jax.Array) -> jax.Array:
+        for k in range(chunks.RANKS):
+            other = start + k
+            rival = padded[other]
+            better = (rival > score) | ((rival == score) & (other.astype(jnp.int32) < row))
+            place = place + better.astype(jnp.int32)
+        return place
+
+    if on_accelerator():
+        place = _num_better(score)
+    else:
+        place = for_chunks(num, chunks.RANKS, step, jnp.zeros_like(row), capacity=size)
+    return jnp.full(size, size, jnp.int32).at[jnp.where(score > 0, place, size)].set(row, mode="drop")

@@ -1,7 +1,7 @@
-"""The fixed-shape toolbox: compaction, prefix sums, counts, masked statistics.
+"""Rows at a fixed shape: compaction, prefix sums, counts, look-ups, masked statistics.
 
-Every function keeps static shapes. A row that is absent is marked by the sentinel index N, one past
-the last; `take` reads zeros there and scatters with ``mode="drop"`` ignore it.
+A row that is absent is marked by the sentinel index N, one past the last; `take` reads zeros there and
+scatters with ``mode="drop"`` ignore it.
 """
 
 import functools
@@ -10,19 +10,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
-from jaxbox.xla.loops import for_chunks
-
-BLOCK = 512
-"""Columns of sums in two levels."""
-
-UNROLL = 4, 3, 2, 1
-"""Numbers taken in one turn of a loop over them, the most that leave no remainder, which would take kernels
-of its own. Four are twice as fast as one."""
-
-WORD_BITS = 32
-"""Bits of a word of a set of flags."""
+from jaxbox.xla.barriers import materialize
+from jaxbox.xla.bits import WORD_BITS, count_bits, pack_bits
+from jaxbox.xla.loops import for_chunks, map_rows
 
 
 def prefix_sum(values: jax.Array) -> jax.Array:
@@ -37,7 +31,7 @@ def prefix_sum(values: jax.Array) -> jax.Array:
     >>> prefix_sum(jnp.array([1, 0, 2])).tolist()
     [1, 1, 3]
     """
-    return _sum_in_blocks(values) if on_accelerator() else _scan_one_by_one(jnp.add, values)
+    return _sum_in_blocks(values) if on_accelerator() else _scan_sequential(jnp.add, values)
 
 
 def prefix_max(values: jax.Array) -> jax.Array:
@@ -52,20 +46,20 @@ def prefix_max(values: jax.Array) -> jax.Array:
     >>> prefix_max(jnp.array([1, 0, 2])).tolist()
     [1, 1, 2]
     """
-    return jax.lax.cummax(values) if on_accelerator() else _scan_one_by_one(jnp.maximum, values)
+    return jax.lax.cummax(values) if on_accelerator() else _scan_sequential(jnp.maximum, values)
 
 
-def _scan_one_by_one(combine: Callable[..., jax.Array], values: jax.Array) -> jax.Array:
+def _scan_sequential(combine: Callable[..., jax.Array], values: jax.Array) -> jax.Array:
     def step(i: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         total, totals = state
         total = combine(total, values[i].astype(jnp.int32))
         return total, totals.at[i].set(total, mode="promise_in_bounds")
 
     size = values.shape[0]
-    return _one_by_one(size, step, (jnp.int32(0), jnp.zeros(size, jnp.int32)))[1]
+    return _sequential(size, step, (jnp.int32(0), jnp.zeros(size, jnp.int32)))[1]
 
 
-def _one_by_one(
+def _sequential(
     size: int,
     step: Callable[[jax.Array, Any], Any],
     state: Any,
@@ -77,7 +71,7 @@ def _one_by_one(
 
     Of several rows one after the other, and no farther than the first `num` of each, or little more.
     """
-    unroll = next(k for k in UNROLL if size % k == 0)
+    unroll = next(k for k in chunks.UNROLLED if size % k == 0)
     in_use = jnp.uint32(size if num is None else (jnp.minimum(num, size) + unroll - 1) // unroll * unroll)
 
     def steps(start: jax.Array, state: Any) -> Any:
@@ -90,8 +84,8 @@ def _one_by_one(
     return for_chunks(rows * in_use, unroll, steps, state)
 
 
-def count(mask: jax.Array) -> jax.Array:
-    """How many entries of a short mask are True; see `count_true` for long ones.
+def count_true(mask: jax.Array) -> jax.Array:
+    """How many entries of a short mask are True; see `count_each` for long ones.
 
     Args:
       mask: (N,) bool, some thousand at most: a CPU takes them one by one, in one kernel instead of three.
@@ -99,16 +93,16 @@ def count(mask: jax.Array) -> jax.Array:
     Returns:
       () int32.
 
-    >>> int(count(jnp.array([True, False, True])))
+    >>> int(count_true(jnp.array([True, False, True])))
     2
     """
     if on_accelerator():
         return jnp.sum(mask, dtype=jnp.int32)
-    return _fold_one_by_one(jnp.add, 0, mask.astype(jnp.int32))
+    return _fold_sequential(jnp.add, 0, mask.astype(jnp.int32))
 
 
-def greatest(values: jax.Array, initial: float) -> jax.Array:
-    """The greatest of a short vector of numbers, see `count`.
+def maximum(values: jax.Array, initial: float) -> jax.Array:
+    """The greatest of a short vector of numbers, see `count_true`.
 
     Args:
       values: (N,) int32 or float32, no NaN.
@@ -117,24 +111,24 @@ def greatest(values: jax.Array, initial: float) -> jax.Array:
     Returns:
       () of the type of the values.
 
-    >>> int(greatest(jnp.array([1, 3, 2]), 0))
+    >>> int(maximum(jnp.array([1, 3, 2]), 0))
     3
     """
     if on_accelerator():
         return jnp.max(values, initial=initial)
-    return _fold_one_by_one(jnp.maximum, initial, values)
+    return _fold_sequential(jnp.maximum, initial, values)
 
 
-def _fold_one_by_one(combine: Callable[..., jax.Array], initial: float, values: jax.Array) -> jax.Array:
+def _fold_sequential(combine: Callable[..., jax.Array], initial: float, values: jax.Array) -> jax.Array:
     init = jnp.asarray(initial, values.dtype)
-    return _one_by_one(values.shape[0], lambda i, state: combine(state, values[i]), init)
+    return _sequential(values.shape[0], lambda i, state: combine(state, values[i]), init)
 
 
 def _sum_in_blocks(values: jax.Array) -> jax.Array:
     size = values.shape[0]
-    if values.dtype == bool and size > BLOCK:
+    if values.dtype == bool and size > chunks.SUM_BLOCK:
         return _count_before(values)
-    blocks = jnp.pad(values.astype(jnp.int32), (0, -size % BLOCK)).reshape(-1, BLOCK)
+    blocks = jnp.pad(values.astype(jnp.int32), (0, -size % chunks.SUM_BLOCK)).reshape(-1, chunks.SUM_BLOCK)
     inside = jnp.cumsum(blocks, axis=1)
     before = jnp.cumsum(inside[:, -1]) - inside[:, -1]
     return (inside + before[:, None]).reshape(-1)[:size]
@@ -144,11 +138,11 @@ def _count_before(mask: jax.Array) -> jax.Array:
     """(N,) prefix sum of truth values, as the bits of words: a sum over words, and bits counted in one."""
     size = mask.shape[0]
     bit = jnp.arange(WORD_BITS, dtype=jnp.uint32)
-    words = _words(mask)
-    population = jax.lax.population_count(words).astype(jnp.int32)
+    words = pack_bits(mask)
+    population = count_bits(words)
     before = _sum_in_blocks(population) - population
     up_to = (jnp.uint32(2) << bit) - 1
-    inside = jax.lax.population_count(words[:, None] & up_to[None]).astype(jnp.int32)
+    inside = count_bits(words[:, None] & up_to[None])
     return (before[:, None] + inside).reshape(-1)[:size]
 
 
@@ -169,12 +163,12 @@ def compact(mask: jax.Array, capacity: int, *, num: jax.Array | None = None) -> 
     [1, 2, 3, 3]
     """
     if on_accelerator():
-        return _compact_at_once(mask.reshape(-1), capacity)
+        return _compact_parallel(mask.reshape(-1), capacity)
     every = jnp.int32(mask.shape[-1])
-    return _compact_one_by_one(jnp.atleast_2d(mask), every if num is None else num, capacity)
+    return _compact_sequential(jnp.atleast_2d(mask), every if num is None else num, capacity)
 
 
-def _compact_at_once(mask: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
+def _compact_parallel(mask: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
     order = prefix_sum(mask)
     target = jnp.where(mask, order - 1, capacity)
     index = jnp.full(capacity, mask.size, jnp.int32)
@@ -182,7 +176,7 @@ def _compact_at_once(mask: jax.Array, capacity: int) -> tuple[jax.Array, jax.Arr
     return index, order[-1]
 
 
-def _compact_one_by_one(mask: jax.Array, num: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
+def _compact_sequential(mask: jax.Array, num: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
     """Each index is written, and the next one over it unless it counts."""
     rows, size = mask.shape
     flags = mask.reshape(-1)
@@ -194,17 +188,10 @@ def _compact_one_by_one(mask: jax.Array, num: jax.Array, capacity: int) -> tuple
         return index, count + flags[i].astype(jnp.uint32)
 
     none = jnp.full(capacity + 1, mask.size, jnp.int32)
-    index, count = _one_by_one(size, step, (none, jnp.uint32(0)), rows=rows, num=num)
+    index, count = _sequential(size, step, (none, jnp.uint32(0)), rows=rows, num=num)
     # Over what the last index wrote if it does not count.
     index = jax.lax.dynamic_update_slice(index, none[:1], (count,))
     return index[:capacity], count.astype(jnp.int32)
-
-
-def _words(mask: jax.Array) -> jax.Array:
-    """(W,) uint32: the flags as the bits of words."""
-    bits = jnp.pad(mask, (0, -mask.shape[0] % WORD_BITS)).reshape(-1, WORD_BITS)
-    bit = jnp.arange(WORD_BITS, dtype=jnp.uint32)
-    return jnp.sum(jnp.where(bits, jnp.uint32(1) << bit, jnp.uint32(0)), axis=1, dtype=jnp.uint32)
 
 
 def rows_in_use(present: jax.Array) -> jax.Array:
@@ -220,7 +207,7 @@ def rows_in_use(present: jax.Array) -> jax.Array:
     2
     """
     number = jnp.arange(1, present.shape[0] + 1, dtype=jnp.int32)
-    return greatest(jnp.where(present, number, 0), 0)
+    return maximum(jnp.where(present, number, 0), 0)
 
 
 def take(rows: jax.Array, index: jax.Array, fill: Any = 0) -> jax.Array:
@@ -274,7 +261,7 @@ def split_index(index: jax.Array, size: int) -> tuple[jax.Array, jax.Array]:
     return jax.lax.div(index, jnp.int32(size)), jax.lax.rem(index, jnp.int32(size))
 
 
-def count_true(*masks: jax.Array) -> jax.Array:
+def count_each(*masks: jax.Array) -> jax.Array:
     """How many entries of each mask are True.
 
     A sum of words counts five masks, each in bits of its own. The sums of those are of floats, since XLA
@@ -286,7 +273,7 @@ def count_true(*masks: jax.Array) -> jax.Array:
     Returns:
       (number of masks,) int32.
 
-    >>> count_true(jnp.array([True, False]), jnp.array([True, True, True])).tolist()
+    >>> count_each(jnp.array([True, False]), jnp.array([True, True, True])).tolist()
     [1, 3]
     """
     bits = WORD_BITS.bit_length()
@@ -333,3 +320,76 @@ def masked_std(values: jax.Array, mask: jax.Array) -> jax.Array:
     """
     centred = values - masked_mean(values, mask)[..., None]
     return jnp.sqrt(masked_mean(centred**2, mask))
+
+
+def first_argmax(values: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The greatest of each column and the first row that has it. Law: `jnp.argmax` and `jnp.max`.
+
+    An argmax does not vectorise on a CPU; a minimum of integers takes several kernels, one of floats one.
+
+    Args:
+      values: (R, C) float32, no NaN, at most 2^24 rows.
+
+    Returns:
+      row: (C,) int32.
+      greatest: (C,) float32.
+    """
+    greatest = jnp.max(values, axis=0)
+    row = jnp.arange(values.shape[0], dtype=jnp.float32)[:, None]
+    first = jnp.min(jnp.where(values >= greatest[None], row, values.shape[0] - 1), axis=0)
+    return first.astype(jnp.int32), greatest
+
+
+def map_selected(
+    function: Callable[[Any], Any],
+    rows: Any,
+    selected: Callable[[], jax.Array],
+    *,
+    num_rows: jax.Array,
+    absent: Any,
+    chunk: int,
+) -> tuple[jax.Array, Any, jax.Array]:
+    """Applies a batched function to selected rows. Law: on them, ``function(rows)`` at the index.
+
+    A CPU lists them first; to list them takes an accelerator longer than to take all.
+
+    Args:
+      function: maps a pytree of (chunk, ...) arrays to an array; what it makes of rows that are not selected
+        must be such that nothing comes of it.
+      rows: pytree of (P, ...) arrays.
+      selected: gives (P,) bool, none of them beyond `num_rows`.
+      num_rows: () int32, how many rows count.
+      absent: pytree of numbers, what rows beyond the last hold.
+      chunk: static, rows at a time on a CPU.
+
+    Returns:
+      index: (P,) int32 of the selected rows, P beyond.
+      values: (P, ...) of those rows.
+      num: () int32; only the first so many of both count.
+    """
+    size = jax.tree.leaves(rows)[0].shape[0]
+    if on_accelerator():
+        return jnp.arange(size, dtype=jnp.int32), function(rows), num_rows
+    index, num = compact(materialize(selected()), size, num=num_rows)
+
+    def at(index: jax.Array) -> Any:
+        # Look-ups do not vectorise within the write of a chunk.
+        return materialize(function(jax.tree.map(lambda a, fill: take(a, index, fill), rows, absent)))
+
+    return index, map_rows(at, index, num_rows=num, chunk=chunk), num
+
+
+def sum_after(values: jax.Array) -> jax.Array:
+    """Sums of the columns after each. Law: ``sum(values) - cumsum(values)``, exact for whole numbers.
+
+    A product is one kernel on a CPU, a cumulative sum several.
+
+    Args:
+      values: (P, C) float32.
+
+    Returns:
+      (P, C) float32.
+    """
+    after = np.tri(values.shape[1], k=-1, dtype=np.float32)
+    # An accelerator would otherwise round whole numbers first.
+    return jnp.dot(values, after, precision=jax.lax.Precision.HIGHEST)

@@ -1,0 +1,181 @@
+"""Length-axis assignments: either side of a rectangle may be the length of the vehicle."""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+
+from jaxbox.config import ClassPrior, CompletionConfig
+from jaxbox.stages.state import NOT_A_BOX, Boxes, Rectangles
+
+NUM_ASSIGNMENTS = 2
+"""Either side of a rectangle may be the length."""
+
+
+NUM_PLACEMENTS = 3
+"""Where a completed width goes: away from the sensor, towards it, or both ways."""
+
+
+SEEN_RAMP = 0.05
+"""Fraction of the usual size over which a side goes from partly hidden to seen whole."""
+
+
+CERTAIN = 1e3
+"""Objective of a box that was not held against evidence: it passes any gate on the objective."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Assignments:
+    """Rectangles, each with one of its sides taken as the length."""
+
+    along: tuple[jax.Array, jax.Array]
+    """(...) m: where the length begins and ends, along the box and from the sensor."""
+    across: tuple[jax.Array, jax.Array]
+    """(...) m: the same of the width, across the box."""
+    yaw: jax.Array
+    """(...) rad, not wrapped."""
+    score: jax.Array
+    """(...) of the rectangle."""
+
+    @property
+    def measured(self) -> tuple[jax.Array, jax.Array]:
+        """(...) m: length and width."""
+        return self.along[1] - self.along[0], self.across[1] - self.across[0]
+
+
+def assign_length_axis(rectangle: Rectangles, side: jax.Array) -> Assignments:
+    """Takes one side of each rectangle as its length: a length-axis assignment.
+
+    Args:
+      rectangle: of any shape.
+      side: int32, broadcasts with them: 0 where the length is along u, 1 where it is along v.
+
+    Returns:
+      Assignments of the shape of both.
+    """
+    (u0, v0), (u1, v1) = (jnp.moveaxis(bounds, -1, 0) for bounds in (rectangle.low, rectangle.high))
+    along_v = side > 0
+    # With the length along v the frame turns by a quarter: across it lies -u.
+    return Assignments(
+        along=(jnp.where(along_v, v0, u0), jnp.where(along_v, v1, u1)),
+        across=(jnp.where(along_v, -u1, v0), jnp.where(along_v, -u0, v1)),
+        yaw=jnp.where(along_v, rectangle.angle + math.pi / 2, rectangle.angle),
+        score=jnp.broadcast_to(rectangle.score, jnp.broadcast_shapes(rectangle.score.shape, side.shape)),
+    )
+
+
+def fits(sides: Assignments, prior: ClassPrior) -> jax.Array:
+    """(...) bool: whether the measured sides are no longer than those of the class."""
+    length, width = sides.measured
+    return (length <= prior.max_length_m) & (width <= prior.max_width_m)
+
+
+def likely_sizes(
+    sides: Assignments, prior: ClassPrior, config: CompletionConfig
+) -> tuple[jax.Array, jax.Array]:
+    """The class's size for sides that may be hidden in part; between it and the measured for the others.
+
+    Args:
+      sides: of any shape.
+      prior: fields of (...) float32.
+      config: from which fraction of the class's size on a side may be seen whole, what its measured size
+        weighs then, and by how much measured sides read short.
+
+    Returns:
+      Length and width (...) float32, m, at least as measured.
+
+    Reference: oracle `jaxbox.reference.likely_size`.
+    """
+
+    def likely(
+        measured: jax.Array,
+        usual: jax.Array | float,
+        seen: jax.Array | float,
+        margin_m: jax.Array | float,
+    ) -> jax.Array:
+        whole = jnp.clip((measured / usual - seen) / SEEN_RAMP, 0, 1)
+        return jnp.maximum(usual + config.seen_weight * whole * (measured + margin_m - usual), measured)
+
+    length, width = sides.measured
+    return (
+        likely(length, prior.length_m, config.seen_length, config.length_margin_m),
+        likely(width, prior.width_m, config.seen_width, config.width_margin_m),
+    )
+
+
+def extend(side: tuple[jax.Array, jax.Array], size: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Centres of an interval grown to `size`: away from the sensor, towards it, both sides."""
+    low, high = side
+    from_low, from_high = low + size / 2, high - size / 2
+    # The same as |low| < |high|, but right for a side without extent too: it grows away.
+    low_is_near = low + high > 0
+    away = jnp.where(low_is_near, from_low, from_high)
+    towards = jnp.where(low_is_near, from_high, from_low)
+    return away, towards, (low + high) / 2
+
+
+def longer_side(rectangle: Rectangles) -> Assignments:
+    """Assignments (P,) with the longer side as length."""
+    along_u, along_v = jnp.moveaxis(rectangle.high - rectangle.low, -1, 0)
+    return assign_length_axis(rectangle, (along_v > along_u).astype(jnp.int32))
+
+
+def keep_measured(sides: Assignments, prior: ClassPrior) -> Boxes:
+    """The rectangles as measured (the paper).
+
+    Args:
+      sides: of any shape.
+      prior: fields of (...) float32.
+
+    Returns:
+      Boxes (...); no box where a measured side is too long.
+    """
+    certain = jnp.where(fits(sides, prior), jnp.float32(CERTAIN), NOT_A_BOX)
+    return place(sides, sides.measured, jnp.zeros_like(certain, jnp.int32), certain)
+
+
+def extend_away(sides: Assignments, prior: ClassPrior, config: CompletionConfig) -> Boxes:
+    """Completes both sides away from the sensor to their likely sizes.
+
+    The sensor sees the near ends of both sides; what is missing is behind them.
+
+    Args:
+      sides: of any shape.
+      prior: fields of (...) float32.
+      config: see `likely_sizes`.
+
+    Returns:
+      Boxes (...); no box where a measured side is too long.
+    """
+    certain = jnp.where(fits(sides, prior), jnp.float32(CERTAIN), NOT_A_BOX)
+    sizes = likely_sizes(sides, prior, config)
+    return place(sides, sizes, jnp.zeros_like(certain, jnp.int32), certain)
+
+
+def place(
+    sides: Assignments, sizes: tuple[jax.Array, jax.Array], placement: jax.Array, objective: jax.Array
+) -> Boxes:
+    """Boxes of a size: the length away from the sensor, the width where `placement` says.
+
+    Args:
+      sides: of any shape.
+      sizes: length and width (...) float32, m, at least as measured.
+      placement: (...) int32, in [0, NUM_PLACEMENTS).
+      objective: (...) float32.
+
+    Returns:
+      Boxes (...).
+    """
+    u, across = extend(sides.along, sizes[0])[0], extend(sides.across, sizes[1])
+    v = jax.lax.select_n(placement, *across)
+    cos, sin = jnp.cos(sides.yaw), jnp.sin(sides.yaw)
+    return Boxes(
+        center=jnp.stack([cos * u - sin * v, sin * u + cos * v], axis=-1),
+        length=sizes[0],
+        width=sizes[1],
+        yaw=sides.yaw,
+        measured=jnp.stack(sides.measured, axis=-1),
+        objective=objective,
+    )

@@ -1,0 +1,203 @@
+"""Assembly of the answer: which points each detection has, the counts of everything, and the status."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxbox.config import DetectorConfig
+from jaxbox.config.capacities import slab_capacity
+from jaxbox.stages.state import (
+    Candidates,
+    Clusters,
+    Completed,
+    Ground,
+    Kept,
+    Obstacles,
+    Outlines,
+    Owners,
+    Sweep,
+)
+from jaxbox.types import GROUND_ABOVE_M, Counts, Descriptors, Detections, Hulls, PointCloud, Status
+from jaxbox.xla import chunks
+from jaxbox.xla.barriers import single_kernel
+from jaxbox.xla.loops import fold_rows
+from jaxbox.xla.rows import count_each, lookup, map_selected, maximum, take
+
+
+def assign_points(kept: Kept, obstacles: Obstacles, clusters: Clusters) -> Owners:
+    """The points of clusters that have a detection, and the detection that each belongs to.
+
+    Args:
+      kept: K detections.
+      obstacles: O points.
+      clusters: of the points.
+
+    Returns:
+      The points that may belong to one, and to which.
+    """
+    num_detections, num_clusters = kept.valid.shape[0], clusters.num_points.shape[0]
+    rank = jnp.where(kept.valid, jnp.arange(num_detections, dtype=jnp.int32), num_detections)
+    of_cluster = jnp.full(num_clusters + 1, num_detections, jnp.int32).at[kept.cluster].min(rank, mode="drop")
+    # No point is inside the box of no detection.
+    frame = jnp.pad(kept.frame, ((0, 1), (0, 0)), constant_values=-1)
+    clusters_of_point = list(clusters.of_point)
+
+    def own(rows: tuple[jax.Array, list[jax.Array]]) -> jax.Array:
+        xy, clusters = rows
+        owner = jnp.full(xy.shape[0], num_detections, jnp.int32)
+        for cluster in clusters:
+            detection = lookup(of_cluster, cluster)
+            x, y, cos, sin, half_length, half_width = jnp.take(frame, detection, axis=0, mode="clip").T
+            dx, dy = xy[:, 0] - x, xy[:, 1] - y
+            inside = jnp.abs(dx * cos + dy * sin) <= half_length
+            inside = inside & (jnp.abs(dy * cos - dx * sin) <= half_width)
+            owner = jnp.minimum(owner, jnp.where(inside, detection, num_detections))
+        return owner
+
+    def may_have_one() -> jax.Array:
+        best = functools.reduce(jnp.minimum, [lookup(of_cluster, cluster) for cluster in clusters_of_point])
+        return best < num_detections
+
+    rows, absent = (obstacles.xy, clusters_of_point), (0, [num_clusters] * len(clusters_of_point))
+    return Owners(
+        *map_selected(own, rows, may_have_one, num_rows=obstacles.count, absent=absent, chunk=chunks.OWNERS)
+    )
+
+
+class Found(NamedTuple):
+    """What all stages found, of which the answer is made."""
+
+    sweep: Sweep
+    ground: Ground
+    obstacles: Obstacles
+    clusters: Clusters
+    outlines: Outlines
+    completed: Completed
+    candidates: Candidates
+    kept: Kept
+
+
+def assemble(
+    cloud: PointCloud,
+    found: Found,
+    owners: Owners,
+    hulls: Hulls,
+    num_points: jax.Array,
+    descriptors: Descriptors,
+    config: DetectorConfig,
+) -> Detections:
+    """Counts where everything went, and gathers the answer.
+
+    Args:
+      cloud: of N rows.
+      found: by all stages.
+      owners: which points may belong to a detection, and to which.
+      hulls: of the points of K detections.
+      num_points: (K,) int32, how many they are.
+      descriptors: of their shapes.
+      config: of the detector.
+
+    Returns:
+      The detections.
+    """
+    sweep, ground, kept = found.sweep, found.ground, found.kept
+    largest_hull = jnp.maximum(maximum(hulls.num_vertices, 0), found.outlines.hull_vertices)
+    points = _count_points(found, config)
+
+    def account() -> tuple[Counts, jax.Array]:
+        counts = _counts(points, cloud, found, largest_hull)
+        return counts, _status(cloud, counts, ground, config)
+
+    counts, status = single_kernel(account)
+    nowhere = jnp.full(sweep.xyz.shape[0], -1, jnp.int32)
+    return Detections(
+        center=kept.center,
+        size=kept.size,
+        yaw=kept.yaw,
+        score=kept.score,
+        label=kept.label,
+        valid=kept.valid,
+        num_points=num_points,
+        hulls=hulls,
+        descriptors=descriptors,
+        ground=ground.plane,
+        ground_mask=sweep.inlier & (ground.height <= config.ground.min_height_m),
+        point_component=nowhere.at[found.obstacles.row].set(found.clusters.component, mode="drop"),
+        point_detection=_claim_points(nowhere, owners, found.obstacles, kept.valid.shape[0]),
+        status=status,
+        counts=counts,
+    )
+
+
+def _claim_points(nowhere: jax.Array, owners: Owners, obstacles: Obstacles, num_detections: int) -> jax.Array:
+    """(N,) int32: the detection of each point of the sweep, -1 for none."""
+
+    def claim(of_point: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
+        index, owner = rows
+        row = take(obstacles.row, index, obstacles.num_rows)
+        return of_point.at[row].set(jnp.where(owner < num_detections, owner, -1), mode="drop")
+
+    absent = owners.row.shape[0], num_detections
+    return fold_rows(claim, nowhere, (owners.row, owners.owner), num_rows=owners.num, absent=absent)
+
+
+def _count_points(found: Found, config: DetectorConfig) -> jax.Array:
+    """Points that are no padding, finite, in the region, no outliers, ground, overhead, and of a cluster."""
+    sweep, height, clusters = found.sweep, found.ground.height, found.clusters
+    above = height > config.ground.min_height_m
+    overhead = above & (height >= config.ground.max_height_m)
+    clustered = jnp.min(clusters.of_point, axis=0) < clusters.num_points.shape[0]
+    kinds = sweep.inlier, sweep.inlier & ~above, sweep.inlier & overhead
+    return count_each(sweep.is_point, sweep.finite, sweep.in_region, *kinds, clustered)
+
+
+def _counts(points: jax.Array, cloud: PointCloud, found: Found, largest_hull: jax.Array) -> Counts:
+    is_point, finite, in_region, inliers, ground, overhead, clustered = points
+    obstacles, clusters = found.obstacles, found.clusters
+    num_obstacles = jnp.minimum(obstacles.count, obstacles.row.shape[0])
+    return Counts(
+        dropped_points=cloud.num_points - is_point,
+        nonfinite_points=is_point - finite,
+        out_of_range_points=finite - in_region,
+        outlier_points=in_region - inliers,
+        ground_points=ground,
+        overhead_points=overhead,
+        dropped_obstacles=obstacles.count - num_obstacles,
+        clustered_points=clustered,
+        unclustered_points=num_obstacles - clustered,
+        obstacles=obstacles.count,
+        slab_points=clusters.num_slab,
+        cells=clusters.num_runs,
+        clusters=clusters.num_found,
+        large_clusters=clusters.num_large,
+        assignments=found.completed.num_assignments,
+        candidates=found.candidates.num,
+        detections=found.kept.num,
+        hull_vertices=largest_hull,
+    )
+
+
+def _status(cloud: PointCloud, counts: Counts, ground: Ground, config: DetectorConfig) -> jax.Array:
+    settings = config.vehicles
+    not_valid = counts.dropped_points + counts.nonfinite_points + counts.out_of_range_points
+    max_clusters = jnp.array([m.max_clusters for m in config.clustering.maps], jnp.int32)
+    max_cells = jnp.array([m.max_cells for m in config.clustering.maps], jnp.int32)
+    bits = {
+        Status.EMPTY: cloud.num_points == not_valid,
+        Status.NONFINITE_POINTS: counts.nonfinite_points > 0,
+        Status.POINT_OVERFLOW: counts.dropped_points > 0,
+        Status.NO_GROUND: ~ground.plane.found,
+        Status.OBSTACLE_OVERFLOW: (counts.dropped_obstacles > 0)
+        | ((config.box.fit_to == "slab") & (counts.slab_points > slab_capacity(config.box, cloud.capacity))),
+        Status.CELL_OVERFLOW: jnp.any(counts.cells > max_cells),
+        Status.CLUSTER_OVERFLOW: jnp.any(counts.clusters > max_clusters)
+        | (counts.large_clusters > settings.max_large),
+        Status.ASSIGNMENT_OVERFLOW: counts.assignments > config.completion.max_assignments,
+        Status.CANDIDATE_OVERFLOW: counts.candidates > settings.max_candidates,
+        Status.DETECTION_OVERFLOW: counts.detections > settings.max_detections,
+        Status.HULL_OVERFLOW: counts.hull_vertices > config.hull.max_vertices,
+        Status.GROUND_ABOVE: ground.plane.found & (ground.plane.coefficients[2] > GROUND_ABOVE_M),
+    }
+    return sum((jnp.where(is_set, jnp.int32(bit), 0) for bit, is_set in bits.items()), jnp.int32(0))

@@ -1,0 +1,83 @@
+"""Barriers: they change no value, only what XLA fuses, computes twice or keeps alive."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxbox.xla.backend import on_accelerator
+
+
+def materialize(values: Any) -> Any:
+    """Has values computed once and stored, where the compiler would compute them in every reader.
+
+    XLA fuses a producer into each of its consumers. A loop is a wall that fusion does not cross, even one of
+    no turn: barriers keep the compiler from seeing that it has none, and that a turn would change nothing.
+    (A conditional would copy what goes through it.) There are no walls on an accelerator, whose host would
+    wait at each.
+
+    Args:
+      values: pytree of arrays.
+
+    Returns:
+      The values.
+    """
+    if on_accelerator():
+        return values
+    never = jax.lax.optimization_barrier(jnp.bool_(False))
+
+    def turn(state: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        return jax.lax.optimization_barrier(state)
+
+    return jax.lax.while_loop(lambda state: state[0], turn, (never, values))[1]
+
+
+def outline(function: Callable[..., Any], *operands: Any) -> Any:
+    """Calls a function in a room of its own: its scratch memory lives while it runs, and no longer.
+
+    XLA makes constants, such as the zeros that a scatter starts from, as early as it can: those of a long
+    program would all be there from its start, beside the scratch of whatever comes first. What is inside a
+    conditional is made when it is needed, and stored. On an accelerator the function is simply called.
+
+    Args:
+      function: of the operands.
+      *operands: whatever it takes.
+
+    Returns:
+      The function's result.
+    """
+    if on_accelerator():
+        return function(*operands)
+    function = jax.jit(function, inline=True)  # Traced once, for both branches.
+    always = jax.lax.optimization_barrier(jnp.bool_(True))
+    return jax.lax.cond(always, lambda: function(*operands), lambda: _zeros_of(function, *operands))
+
+
+def single_kernel(function: Callable[..., Any], *operands: Any) -> Any:
+    """Computes a few dozen numbers in one kernel, where each would have its own.
+
+    XLA compiles so small a loop, here of one turn, to native code on the CPU, see
+    `chunks.SINGLE_KERNEL_NUMBERS`. On an accelerator the function is simply called.
+
+    Args:
+      function: of the operands.
+      *operands: whatever it takes.
+
+    Returns:
+      The function's result.
+    """
+    if on_accelerator():
+        return function(*operands)
+    function = jax.jit(function, inline=True)  # Traced once, for its shapes and for the loop.
+    once = jax.lax.optimization_barrier(jnp.bool_(True))
+
+    def turn(_: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        return jnp.bool_(False), function(*operands)
+
+    return jax.lax.while_loop(lambda state: state[0], turn, (once, _zeros_of(function, *operands)))[1]
+
+
+def _zeros_of(function: Callable[..., Any], *operands: Any) -> Any:
+    """Zeros in the shapes of a function's result."""
+    return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, *operands))

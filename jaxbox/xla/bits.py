@@ -1,0 +1,53 @@
+"""Truth values as the bits of words."""
+
+import jax
+import jax.numpy as jnp
+
+WORD_BITS = 32
+"""Bits of a word of a set of flags."""
+
+
+def pack_bits(flags: jax.Array, *, axis: int = -1) -> jax.Array:
+    """Packs truth values along an axis. Law: bit b of word w is flag 32 w + b.
+
+    Args:
+      flags: (..., N, ...) bool or uint8, 0 or 1.
+      axis: static, along which N lies.
+
+    Returns:
+      (..., ceil(N / 32), ...) uint32.
+
+    >>> pack_bits(jnp.array([True, False, True])).tolist()
+    [5]
+    """
+    axis %= flags.ndim
+    before, size, after = flags.shape[:axis], flags.shape[axis], flags.shape[axis + 1 :]
+    if size % WORD_BITS:
+        flags = jnp.pad(flags, [(0, -size % WORD_BITS) if a == axis else (0, 0) for a in range(flags.ndim)])
+    bits = flags.reshape(*before, -1, WORD_BITS, *after).astype(jnp.uint32)
+    place = jnp.arange(WORD_BITS, dtype=jnp.uint32).reshape(*[1] * (axis + 1), WORD_BITS, *[1] * len(after))
+    return jnp.sum(bits << place, axis=axis + 1, dtype=jnp.uint32)
+
+
+def count_bits(words: jax.Array) -> jax.Array:
+    """Counts the bits that are set in each word. Law: the sum of the flags that `pack_bits` packed.
+
+    Args:
+      words: (...) uint32.
+
+    Returns:
+      (...) int32.
+    """
+    return jax.lax.population_count(words).astype(jnp.int32)
+
+
+def lowest_bit(words: jax.Array) -> jax.Array:
+    """Finds the place of the lowest bit that is set. Law: the first True of the flags.
+
+    Args:
+      words: (...) uint32, not zero.
+
+    Returns:
+      (...) uint32, in [0, 32).
+    """
+    return jax.lax.population_count((words & -words) - 1)

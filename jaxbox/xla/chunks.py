@@ -1,0 +1,77 @@
+"""The one table of chunk sizes: how much is worked on at a time, on a CPU unless it says otherwise.
+
+None of them changes a result. A chunk is large enough for wide vectors and few turns of a loop, and small
+enough for its scratch memory to stay in the cache; with one row at a time XLA compiles a loop to native code.
+Each was chosen by ``python -m benchmarks.bench_stages``, on real sweeps, beside half and twice its size; what
+came of it is in docs/notes/kernels_on_cpu.md, unless another place is named.
+"""
+
+FILTER_BLOCKS = 1024
+"""Occupied blocks of cells that mean shift moves at a time; a sweep of 64 beams has some 1,500 to 3,000."""
+
+FILTER_BLOCK_CELLS = 4
+"""Cells side by side in one of those blocks."""
+
+MINIMA_TABLES = 4
+"""Tables that points take turns with where a minimum is kept for each cell: neighbours lie in one cell, and a
+processor waits for what it has just written."""
+
+PLANES = 32
+"""RANSAC hypotheses tried at a time: few enough for their residuals to stay in the cache."""
+
+MAP_POINTS = 8192
+"""Points whose cell, component or cluster is looked up at a time."""
+
+STATISTICS_MAPS = 4
+"""Maps gone through in one native loop: with too much to do in a step, it would no longer be native."""
+
+HULL_POINTS = 4096
+"""Points put into slices at a time: two threads share so large a chunk."""
+
+HULLS = 32
+"""Clusters whose hulls are traced at a time."""
+
+ROTATIONS = 64
+"""Clusters tried at all rotations at a time: their extents stay in the cache."""
+
+VOTES = 64
+"""Votes for the scene's direction at a time: few boxes of a sweep vote."""
+
+PROPOSALS = 256
+"""Proposals held against the evidence at a time: a loop over their points has few, wide steps."""
+
+RAYS = 128
+"""Boxes that rays are cast over at a time, for votes as for scores: equal kernels are compiled once
+(docs/notes/compile_time.md)."""
+
+BOXES = 128
+"""Boxes whose neighbourhood is counted at a time."""
+
+RUN_ROWS = 32
+"""Neighbouring rows of a run in one block of `jaxbox.xla.runs`; a count of 6 bits holds 63."""
+
+RUN_BLOCKS, RUN_BLOCKS_ON_ACCELERATOR = 1024, 8192
+"""Such blocks looked at in one go (the second: docs/notes/accelerators.md)."""
+
+RANKS = 16
+"""Rows that all others are compared with in one step."""
+
+OVERLAP_TILE = 32
+"""Rows and columns of the matrix of overlaps at a time: a word of bits each row."""
+
+OWNERS = 4096
+"""Points whose detections are looked up at a time."""
+
+FOLDED_POINTS = 4
+"""Points of each cluster folded in one step of the loop over them."""
+
+UNROLLED = 4, 3, 2, 1
+"""Numbers taken in one turn of a native loop, the most that leave no remainder, which would take kernels of
+its own. Four are twice as fast as one."""
+
+SUM_BLOCK = 512
+"""Columns of sums in two levels, on an accelerator (docs/notes/accelerators.md)."""
+
+SINGLE_KERNEL_NUMBERS = 62
+"""Numbers that `jaxbox.xla.barriers.single_kernel` may copy: what reads and writes more than a kilobyte is no
+small loop to XLA."""

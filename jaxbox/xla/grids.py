@@ -1,0 +1,78 @@
+"""Sums over windows of a grid's cells, and functions of the cells that are occupied."""
+
+import functools
+import itertools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from jaxbox.xla import chunks
+from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.loops import for_chunks
+from jaxbox.xla.rows import compact
+
+
+def map_cells(
+    function: Callable[[jax.Array], jax.Array], cells: jax.Array, sums: jax.Array
+) -> list[jax.Array]:
+    """Looks up for each point a function of its cell. Law: the columns of ``function(cells)``.
+
+    A CPU applies the function once to each block of neighbouring cells that holds points; to list those takes
+    as many kernels on an accelerator as all else.
+
+    Args:
+      function: maps cells (C,) to (C, 4).
+      cells: (N,) uint32, of each point.
+      sums: (cells, 4) float32; the last column counts the points of each cell.
+
+    Returns:
+      The first three columns, (N,) each; anything finite or infinite for points whose cell counts none.
+    """
+    if on_accelerator():
+        of_point = function(cells)
+        return [of_point[:, axis] for axis in range(3)]
+    of_cell = _of_occupied(function, sums).reshape(-1)
+    return [of_cell[4 * cells + axis] for axis in range(3)]
+
+
+def _of_occupied(function: Callable[[jax.Array], jax.Array], sums: jax.Array) -> jax.Array:
+    """(C, 4) a function of the cells that hold points; anything in the others."""
+    size = chunks.FILTER_BLOCK_CELLS * 4
+    blocks = sums.reshape(-1, size)
+    # A product, since it is computed once: the compiler would count again in each reader.
+    count = blocks @ jnp.tile(jnp.array([0, 0, 0, 1], jnp.float32), chunks.FILTER_BLOCK_CELLS)
+    occupied, num = compact(count > 0, blocks.shape[0])
+
+    def step(start: jax.Array, ends: jax.Array) -> jax.Array:
+        block = jax.lax.dynamic_slice_in_dim(occupied, start, min(chunks.FILTER_BLOCKS, blocks.shape[0]))
+        cell = (
+            block[:, None] * chunks.FILTER_BLOCK_CELLS
+            + jnp.arange(chunks.FILTER_BLOCK_CELLS, dtype=jnp.int32)[None]
+        )
+        return ends.at[block].set(function(cell.reshape(-1)).reshape(-1, size), mode="drop")
+
+    return for_chunks(num, chunks.FILTER_BLOCKS, step, blocks)
+
+
+def window_sums(sums: jax.Array, stride: int, weight: jax.Array) -> jax.Array:
+    """Weighted sums over the 3 x 3 x 3 windows of all cells but the margins. Law: a separable convolution.
+
+    Args:
+      sums: (lines, 4 width) float32: four numbers a cell, lines of cells side by side.
+      stride: static, lines from one x to the next; neighbouring lines are levels.
+      weight: () float32, of a neighbour along each axis; the cell itself weighs 1.
+
+    Returns:
+      (lines - 2 stride - 2, 4 width - 8) float32.
+    """
+    if on_accelerator():
+        # Both passes over whole lines of cells in one kernel.
+        size = sums.shape[0] - 2 * (stride + 1)
+        corners = itertools.product((0, 1, 2), repeat=2)
+        starts = [(i * stride + k, weight ** (abs(i - 1) + abs(k - 1))) for i, k in corners]
+        sums = functools.reduce(jnp.add, [each * sums[start : start + size] for start, each in starts])
+    else:
+        for step in (stride, 1):
+            sums = sums[step:-step] + weight * (sums[: -2 * step] + sums[2 * step :])
+    return sums[:, 4:-4] + weight * (sums[:, :-8] + sums[:, 8:])

@@ -1,0 +1,37 @@
+"""Pseudo-random numbers by hashing."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+
+GOLDEN_RATIO_BITS = 0x9E3779B9
+"""2^32 over the golden ratio: its multiples fill the 32 bits evenly."""
+
+
+def hashed_uniform(key: jax.Array, round_index: int, shape: tuple[int, ...]) -> jax.Array:
+    """Numbers in [0, 1) from a key. Law: another key or round gives others, each value as likely as another.
+
+    They are hashes of the key, even enough for RANSAC and far cheaper than `jax.random`.
+
+    Args:
+      key: JAX random key.
+      round_index: static; another round draws other numbers.
+      shape: static.
+
+    Returns:
+      (shape) float32.
+    """
+    state = jnp.uint32(round_index)
+    for word in jax.random.key_data(key).reshape(-1):
+        state = _scramble(state ^ word)
+    counter = jnp.arange(math.prod(shape), dtype=jnp.uint32).reshape(shape)
+    # The upper 24 bits: float32 holds no more.
+    return (_scramble(counter * jnp.uint32(GOLDEN_RATIO_BITS) + state) >> 8).astype(jnp.float32) / 2**24
+
+
+def _scramble(word: jax.Array) -> jax.Array:
+    """A bijection of 32 bits in which each bit depends on all: the last step of MurmurHash3."""
+    word = (word ^ (word >> 16)) * jnp.uint32(0x85EBCA6B)
+    word = (word ^ (word >> 13)) * jnp.uint32(0xC2B2AE35)
+    return word ^ (word >> 16)

@@ -1,0 +1,152 @@
+"""Range cells of a polar grid as the bits of words, each with what lies before or beyond its block."""
+
+import functools
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.barriers import materialize
+from jaxbox.xla.bits import lowest_bit
+from jaxbox.xla.rows import lookup
+
+BLOCK_BITS = 4
+
+
+BLOCK = 2**BLOCK_BITS
+"""Range cells of one word of the evidence: a bit of its low half each; the high half tells of the others."""
+
+
+NEVER = 2**BLOCK - 1
+"""Range cell of the next hit where there is none."""
+
+
+def count_changes(size: int, first: jax.Array, last: jax.Array) -> jax.Array:
+    """Intervals that begin in each cell less those that end there. Law: ``bincount(first) - bincount(last)``.
+
+    Args:
+      size: static, number of cells.
+      first: (N,) int32 cells; those beyond the last are left out.
+      last: (N,) int32, likewise.
+
+    Returns:
+      (size,) int32.
+    """
+    beams, ends = jnp.zeros(size, jnp.int32), (first, last)
+    if on_accelerator():
+        # One scatter reads and writes the cells once, which counts in a batch.
+        return beams.at[jnp.stack(ends)].add(jnp.array([[1], [-1]], jnp.int32), mode="drop")
+    return beams.at[ends[0]].add(1, mode="drop").at[ends[1]].add(-1, mode="drop")
+
+
+def covered_words(beams: jax.Array) -> jax.Array:
+    """Words of the cells that intervals cover. Law: bit k is ``cumsum(beams) > 0``; see `set_before`.
+
+    Args:
+      beams: (B, 16, A) int32, how many more intervals begin than end in each cell, along the first two axes.
+
+    Returns:
+      (B, A) uint32: which cells of a block are covered, and, from bit 16 on, how many before the block.
+    """
+    running = _sum_before(functools.reduce(jnp.add, (beams[:, k] for k in range(BLOCK))))
+    free = jnp.zeros_like(running, jnp.uint32)
+    for k in range(BLOCK):
+        running = running + beams[:, k]
+        free = free | ((running > 0).astype(jnp.uint32) << k)
+    before = _sum_before(jax.lax.population_count(free).astype(jnp.int32))
+    return free | (before.astype(jnp.uint32) << BLOCK)
+
+
+def _sum_before(blocks: jax.Array) -> jax.Array:
+    """Sums of the rows before each row. A scan over few wide rows is the fastest of its kind (XLA, CPU)."""
+    if on_accelerator():
+        return jnp.cumsum(blocks, axis=0) - blocks
+    return jax.lax.scan(lambda total, row: (total + row, total), jnp.zeros_like(blocks[0]), blocks)[1]
+
+
+def next_words(hits: jax.Array) -> jax.Array:
+    """Words that tell of the next flag. Law: `next_set` is the first flag at a cell or beyond.
+
+    Args:
+      hits: (B, 16, A) bool, along the first two axes.
+
+    Returns:
+      (B, A) uint32: which cells of a block are flagged, and, from bit 16 on, the first flagged cell beyond
+      the block, or `NEVER`.
+    """
+    hit = jnp.zeros((hits.shape[0], hits.shape[2]), jnp.uint32)
+    for k in range(BLOCK):
+        hit = hit | (hits[:, k].astype(jnp.uint32) << k)
+    start = jnp.arange(hits.shape[0], dtype=jnp.uint32)[:, None] * BLOCK
+    first = jnp.where(hit > 0, start + lowest_bit(hit), NEVER)
+
+    def step(beyond: jax.Array, first: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jnp.minimum(beyond, first), beyond
+
+    if on_accelerator():
+        least = jax.lax.cummin(first, axis=0, reverse=True)
+        beyond = jnp.pad(least[1:], ((0, 1), (0, 0)), constant_values=NEVER)
+    else:
+        beyond = jax.lax.scan(step, jnp.full_like(first[0], NEVER), first, reverse=True)[1]
+    return hit | (beyond << BLOCK)
+
+
+def flagged_cells(words: jax.Array | np.ndarray) -> np.ndarray:
+    """Which cells of the blocks are set, for pictures and tests. Law: what the words were made of.
+
+    Args:
+      words: (B, A) uint32.
+
+    Returns:
+      (16 B, A) bool, by range and azimuth.
+    """
+    bits = np.asarray(words)[:, None] >> np.arange(BLOCK, dtype=np.uint32)[:, None]
+    return (bits & 1).astype(bool).reshape(-1, words.shape[1])
+
+
+def next_set(words: jax.Array, cell: jax.Array) -> jax.Array:
+    """The first flagged cell at a cell or beyond. Law: as a search cell by cell.
+
+    Args:
+      words: of the block of the cell, see `words_at`.
+      cell: (...) int32.
+
+    Returns:
+      (...) int32, `NEVER` where there is none.
+    """
+    bit = (cell & (BLOCK - 1)).astype(jnp.uint32)
+    rest = (words & NEVER) >> bit
+    return jnp.where(rest > 0, cell + lowest_bit(rest).astype(jnp.int32), (words >> BLOCK).astype(jnp.int32))
+
+
+def set_before(words: jax.Array, cell: jax.Array) -> jax.Array:
+    """How many cells before one are covered. Law: ``cumsum(covered) - covered``.
+
+    Args:
+      words: of the block of the cell, see `words_at`.
+      cell: (...) int32.
+
+    Returns:
+      (...) int32.
+    """
+    below = (jnp.uint32(1) << (cell & (BLOCK - 1)).astype(jnp.uint32)) - 1
+    return ((words >> BLOCK) + jax.lax.population_count(words & below)).astype(jnp.int32)
+
+
+def words_at(tables: Sequence[jax.Array], cells: Sequence[jax.Array], column: jax.Array) -> list[jax.Array]:
+    """The words of cells. Law: ``table[cell // 16, column]`` of each table.
+
+    Args:
+      tables: (B, A) uint32 each.
+      cells: (...) int32 of each.
+      column: (...) int32.
+
+    Returns:
+      (...) uint32 of each table.
+    """
+    # What a look-up has to work out first does not vectorise.
+    cells = materialize(tuple(cells))
+    places = materialize([(cell >> BLOCK_BITS) * tables[0].shape[1] + column for cell in cells])
+    return [lookup(table.reshape(-1), place) for table, place in zip(tables, places, strict=True)]

@@ -1,0 +1,158 @@
+"""Reductions of rows by segment: by component, by cell, by slice."""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbox.xla import chunks
+from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.bits import WORD_BITS
+
+Columns = Sequence[jax.Array]
+"""What is reduced of a row: numbers () each, or (N,) of all rows."""
+
+
+def reduce_segments(
+    describe: Callable[[Any], tuple[Columns, Columns]],
+    rows: Any,
+    segment: jax.Array,
+    *,
+    num_rows: jax.Array,
+    num_segments: int,
+) -> jax.Array:
+    """Maxima and sums over the rows of each segment. Law: `jax.ops.segment_max` and `segment_sum`.
+
+    Args:
+      describe: gives the numbers of rows whose maxima are sought, and those whose sums are.
+      rows: pytree of (N, ...) arrays.
+      segment: (maps, N) int32, of each row on each map, in [0, S).
+      num_rows: () int32; only the first so many rows count.
+      num_segments: static, S.
+
+    Returns:
+      (S, maxima + sums) float32: minus infinity and 0 where a segment has no row. Sums are whole numbers,
+      which float32 counts exactly up to 2^24.
+    """
+    num_rows = jnp.minimum(num_rows, segment.shape[1])
+    maxima, sums = jax.eval_shape(describe, rows)
+    is_maximum = np.arange(len(maxima) + len(sums)) < len(maxima)
+    none = jnp.where(is_maximum, jnp.float32(-jnp.inf), 0)
+    none = jnp.broadcast_to(none, (num_segments, is_maximum.size))
+    reduce = _reduce_parallel if on_accelerator() else _reduce_sequential
+    return reduce(describe, rows, segment, num_rows, none, is_maximum)
+
+
+def _reduce_sequential(
+    describe: Callable[[Any], tuple[Columns, Columns]],
+    rows: Any,
+    segment: jax.Array,
+    num_rows: jax.Array,
+    table: jax.Array,
+    is_maximum: np.ndarray,
+) -> jax.Array:
+    """Row after row: XLA compiles so small a loop to native code, which adds all columns at once."""
+
+    def add(maps: range, i: jax.Array, table: jax.Array) -> jax.Array:
+        own = _as_row(describe(jax.tree.map(lambda a: a[i], rows)))
+        for on_map in maps:
+            row = segment[on_map, i]
+            before = table[row]
+            joined = jnp.where(is_maximum, jnp.maximum(before, own), before + own)
+            table = jax.lax.dynamic_update_index_in_dim(table, joined, row, 0)
+        return table
+
+    maps = range(segment.shape[0])
+    for first in maps[:: chunks.STATISTICS_MAPS]:
+        some = maps[first : first + chunks.STATISTICS_MAPS]
+        table = jax.lax.fori_loop(0, num_rows, functools.partial(add, some), table)
+    return table
+
+
+def _reduce_parallel(
+    describe: Callable[[Any], tuple[Columns, Columns]],
+    rows: Any,
+    segment: jax.Array,
+    num_rows: jax.Array,
+    table: jax.Array,
+    is_maximum: np.ndarray,
+) -> jax.Array:
+    valid = jnp.arange(segment.shape[1], dtype=jnp.int32) < num_rows
+    row = jnp.where(valid, segment, table.shape[0])
+    own = jnp.broadcast_to(_as_row(describe(rows)), (*row.shape, table.shape[1]))
+    num_maxima = int(is_maximum.sum())
+    maxima = table[:, :num_maxima].at[row].max(own[..., :num_maxima], mode="drop")
+    # Whole numbers: ordered scatters of floats cost accelerators more.
+    sums = jnp.zeros((table.shape[0], table.shape[1] - num_maxima), jnp.int32)
+    sums = sums.at[row].add(own[..., num_maxima:].astype(jnp.int32), mode="drop")
+    return jnp.concatenate([maxima, sums.astype(jnp.float32)], axis=1)
+
+
+def _as_row(columns: tuple[Columns, Columns]) -> jax.Array:
+    """(..., columns) of a row alone. Chosen column by column, as a stack does not vectorise."""
+    values = [*columns[0], *columns[1]]
+    column = np.arange(len(values))
+    row = values[-1][..., None]
+    for k, value in enumerate(values[:-1]):
+        row = jnp.where(column == k, value[..., None], row)
+    return row
+
+
+def segment_minima(
+    values: jax.Array, segment: jax.Array, valid: jax.Array, *, num_segments: int
+) -> jax.Array:
+    """The least value of each segment. Law: `jax.ops.segment_min` of the valid values.
+
+    Args:
+      values: (N,) float32.
+      segment: (N,) int32; values beyond the last segment are left out.
+      valid: (N,) bool, values that count.
+      num_segments: static, S.
+
+    Returns:
+      (S,) float32, infinite where there is none.
+    """
+    table = jnp.arange(values.shape[0], dtype=jnp.int32) % chunks.MINIMA_TABLES
+    num_places = chunks.MINIMA_TABLES * num_segments
+    # What lies past the last segment would be another table's.
+    place = jnp.where(valid & (segment < num_segments), table * num_segments + segment, num_places)
+    lowest = jnp.full(num_places, jnp.inf, jnp.float32).at[place].min(values, mode="drop")
+    return jnp.min(lowest.reshape(chunks.MINIMA_TABLES, -1), axis=0)
+
+
+def argmax_key(value: jax.Array, index: jax.Array, num_rows: int) -> jax.Array:
+    """Words whose maximum tells where a value is greatest. Law: `argmax_row` of it, but for quantisation.
+
+    The value's leading bits stand above the index in one word, so that one scatter finds both. The value is
+    quantised to at least 2^-11 for up to a million rows.
+
+    Args:
+      value: (...) float32, in [0, 1].
+      index: (...) int32, in [0, num_rows).
+      num_rows: static.
+
+    Returns:
+      (...) uint32, above 0.
+    """
+    index_bits = num_rows.bit_length()
+    # More bits than float32 holds would round the largest value up, out of the word.
+    value_bits = min(WORD_BITS - index_bits, 24)
+    # Conversions to int32 vectorise, those to uint32 do not.
+    quantised = (value * (2**value_bits - 1)).astype(jnp.int32).astype(jnp.uint32)
+    return (quantised << index_bits) | (index.astype(jnp.uint32) + 1)
+
+
+def argmax_row(key: jax.Array, num_rows: int) -> jax.Array:
+    """The index of an `argmax_key`.
+
+    Args:
+      key: (...) uint32, 0 for none.
+      num_rows: static, as `argmax_key` was given it.
+
+    Returns:
+      (...) int32, -1 for none.
+    """
+    return (key & (2 ** num_rows.bit_length() - 1)).astype(jnp.int32) - 1

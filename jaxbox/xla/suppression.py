@@ -1,0 +1,87 @@
+"""Greedy suppression of rows by better ones, at a fixed shape."""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from jaxbox.xla import chunks
+from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.bits import pack_bits
+from jaxbox.xla.loops import for_chunks
+from jaxbox.xla.rows import count_true
+
+ROUNDS = 6
+"""Rounds on an accelerator before the host looks whether they were enough."""
+
+Conflict = Callable[[jax.Array, jax.Array], jax.Array]
+"""Whether two rows exclude each other, () bool."""
+
+
+def suppress_conflicts(rows: jax.Array, valid: jax.Array, conflict: Conflict) -> jax.Array:
+    """Keeps each row that is in conflict with no earlier row that is kept. Law: the greedy loop.
+
+    A row depends on earlier ones only: after k rounds over all rows the first k are right, and where nothing
+    changes all are. A few rounds do, as chains of rows in conflict one after the other are short.
+
+    Args:
+      rows: (P, ...), best first.
+      valid: (P,) bool, rows that count, all before the others.
+      conflict: of two rows; symmetric.
+
+    Returns:
+      (P,) bool.
+    """
+    if on_accelerator():
+        return _suppress_parallel(rows, valid, conflict)
+    rivals = _rivals(rows, count_true(valid), conflict)[: valid.shape[0]]
+
+    def without_rivals(keep: jax.Array) -> jax.Array:
+        return valid & ~jnp.any((rivals & keep[None]) != 0, axis=1)
+
+    def step(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        _, keep = state
+        return keep, pack_bits(without_rivals(keep))
+
+    every = pack_bits(valid)
+    init = jnp.zeros_like(every), every
+    return without_rivals(jax.lax.while_loop(lambda s: jnp.any(s[0] != s[1]), step, init)[1])
+
+
+def _suppress_parallel(rows: jax.Array, valid: jax.Array, conflict: Conflict) -> jax.Array:
+    """As `suppress_conflicts`, all pairs at once, and some rounds before the host looks whether they do."""
+    row = jnp.arange(valid.shape[0], dtype=jnp.int32)
+    rivals = _all_pairs(conflict, rows, rows) & (row[None] < row[:, None])
+
+    def step(keep: jax.Array) -> jax.Array:
+        return valid & ~jnp.any(rivals & keep[None], axis=1)
+
+    def rounds(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        before_last = functools.reduce(lambda keep, _: step(keep), range(ROUNDS - 1), state[1])
+        return before_last, step(before_last)
+
+    return jax.lax.while_loop(lambda s: jnp.any(s[0] != s[1]), rounds, rounds((valid, valid)))[1]
+
+
+def _all_pairs(conflict: Conflict, first: jax.Array, second: jax.Array) -> jax.Array:
+    return jax.vmap(jax.vmap(conflict, (None, 0)), (0, None))(first, second)
+
+
+def _rivals(rows: jax.Array, num_rows: jax.Array, conflict: Conflict) -> jax.Array:
+    """(P, P / 32) uint32: which earlier rows each one is in conflict with, as bits."""
+    tile = chunks.OVERLAP_TILE
+    rows = jnp.pad(rows, [(0, -rows.shape[0] % tile)] + [(0, 0)] * (rows.ndim - 1))
+    row = jnp.arange(tile, dtype=jnp.uint32)
+
+    def fill(i: jax.Array, j: jax.Array, bits: jax.Array) -> jax.Array:
+        first, second = (jax.lax.dynamic_slice_in_dim(rows, k, tile) for k in (i, j))
+        earlier = j + row[None] < i + row[:, None]
+        new = pack_bits(_all_pairs(conflict, first, second) & earlier)
+        return jax.lax.dynamic_update_slice(bits, new, (i, j // tile))
+
+    def fill_row(i: jax.Array, bits: jax.Array) -> jax.Array:
+        return for_chunks(i + 1, tile, functools.partial(fill, i), bits)
+
+    bits = jnp.zeros((rows.shape[0], rows.shape[0] // tile), jnp.uint32)
+    return for_chunks(num_rows, tile, fill_row, bits)
