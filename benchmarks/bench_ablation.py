@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks import bench_accuracy, common
 from jaxbox import DetectorConfig
-from jaxbox.config.fields import replace_settings
+from jaxbox.config.fields import replace_fields
 from jaxbox.evaluation.copies import COPIES, Copy, Frame, label_points, read_frame
 from jaxbox.io import open_sweeps
 
@@ -138,7 +138,7 @@ def measure(
     num_points = {frame.name: label_points(frame) for frame in frames}
     table: dict[str, dict[str, Any]] = {}
     for ablation in (Ablation(FULL, {}), *ablations):
-        config = replace_settings(base, ablation.changes)
+        config = replace_fields(base, ablation.changes)
         by_copy, statuses = {}, []
         for copy in copies:
             by_copy[copy.name], bits = copy_figures(frames, num_points, copy, config)

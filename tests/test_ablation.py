@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxbox import DetectorConfig, steps
-from jaxbox.config.fields import replace_settings
+from jaxbox.config.fields import replace_fields
 
 
 @pytest.fixture
@@ -20,7 +20,7 @@ def bench(monkeypatch):
 def test_every_ablation_changes_the_default_preset_to_one_that_detect_takes(bench):
     seen = [DetectorConfig()]
     for ablation in bench.ABLATIONS:
-        config = replace_settings(DetectorConfig(), ablation.changes)
+        config = replace_fields(DetectorConfig(), ablation.changes)
         steps.check_settings(config)
         assert config not in seen, f"{ablation.name} repeats another row"
         seen.append(config)
@@ -29,7 +29,7 @@ def test_every_ablation_changes_the_default_preset_to_one_that_detect_takes(benc
 
 def test_most_ablations_share_the_compiled_program_of_the_preset(bench):
     static = jax.tree.structure(DetectorConfig())
-    changed = [replace_settings(DetectorConfig(), ablation.changes) for ablation in bench.ABLATIONS]
+    changed = [replace_fields(DetectorConfig(), ablation.changes) for ablation in bench.ABLATIONS]
     shared = [config for config in changed if jax.tree.structure(config) == static]
     assert len(shared) > len(changed) / 2
 

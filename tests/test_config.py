@@ -16,7 +16,7 @@ from jaxbox.config import (
     RegionConfig,
     propose_capacities,
 )
-from jaxbox.config.schema import CAPACITY_STEP
+from jaxbox.config.presets import CAPACITY_STEP
 from jaxbox.io import open_sweeps
 from jaxbox.synthetic import make_sweep
 

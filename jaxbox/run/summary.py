@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxbox.config import DEFAULT_CUT, DetectorConfig
+from jaxbox.config import DEFAULT_SCORE_THRESHOLD, DetectorConfig
 from jaxbox.config.schema import GROUND_CANDIDATE_CELL_M
 from jaxbox.types import NUM_POINT_COUNTS, Counts, Detections, GroundPlane, Label, Status
 
@@ -167,7 +167,10 @@ class Summary:
 
 
 def summarise(
-    detections: Detections, config: DetectorConfig | None = None, *, min_score: float = DEFAULT_CUT
+    detections: Detections,
+    config: DetectorConfig | None = None,
+    *,
+    min_score: float = DEFAULT_SCORE_THRESHOLD,
 ) -> Summary:
     """Gathers what a system alarms on: counts a stage, how full each capacity was, boxes, the ground.
 

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 
 from jaxbox.config import DetectorConfig
-from jaxbox.config.fields import traced_settings
+from jaxbox.config.fields import traced_fields
 
 
 def _always(_: DetectorConfig) -> bool:
@@ -56,7 +56,7 @@ class Threshold:
         >>> THRESHOLDS["ground"][0].value(DetectorConfig())
         0.1
         """
-        return float(traced_settings(config)[self.name])
+        return float(traced_fields(config)[self.name])
 
 
 THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {

@@ -5,14 +5,8 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from jaxbox.config.schema import (
-    ClusteringConfig,
-    ComponentMap,
-    DetectorConfig,
-    GroundConfig,
-    rounded_up,
-    with_max_cells,
-)
+from jaxbox.config.presets import DetectorConfig, rounded_up, with_max_cells
+from jaxbox.config.schema import ClusteringConfig, ComponentMap, GroundConfig
 
 
 def propose_capacities(
@@ -77,8 +71,8 @@ def _rough_counts(config: DetectorConfig, index: int, xyz: np.ndarray) -> list[i
     xyz = xyz[within].astype(np.float64)
     xy, height = xyz[:, :2], _rough_height(xyz)
 
-    def between(settings: GroundConfig | ComponentMap) -> np.ndarray:
-        return (height > settings.min_height_m) & (height < settings.max_height_m)
+    def between(limits: GroundConfig | ComponentMap) -> np.ndarray:
+        return (height > limits.min_height_m) & (height < limits.max_height_m)
 
     slab = (height > config.box.slab_min_height_m) & (height < config.box.slab_max_height_m)
     drawn = _rough_warp(xy, config.clustering)
@@ -103,11 +97,11 @@ def _rough_height(xyz: np.ndarray) -> np.ndarray:
     return xyz[:, 2] - lowest[cell[:, 0] + 1, cell[:, 1] + 1]
 
 
-def _rough_warp(xy: np.ndarray, settings: ClusteringConfig) -> np.ndarray:
+def _rough_warp(xy: np.ndarray, config: ClusteringConfig) -> np.ndarray:
     """Far points drawn together as the maps draw them, so that beyond the start cells hold more."""
     rho = np.linalg.norm(xy, axis=1)
     beyond, growth = (
-        np.maximum(rho - settings.adaptive_start_m, 0),
-        max(float(settings.adaptive_growth), 1e-9),
+        np.maximum(rho - config.adaptive_start_m, 0),
+        max(float(config.adaptive_growth), 1e-9),
     )
     return xy * (1 + (np.log1p(growth * beyond) / growth - beyond) / np.maximum(rho, 1e-9))[:, None]
