@@ -10,6 +10,7 @@ from rich.console import Console
 from jaxbox import io
 from jaxbox._padding import fitting_capacity
 from jaxbox.config import DetectorConfig, propose_capacities
+from jaxbox.config.capacities import capacity_sizes
 from jaxbox.config.fields import changed_fields
 from jaxbox.config.sensors import TUNED_BEAMS, fitting_sensor
 from jaxbox.evaluation.beams import beam_of_points, goes_beam_by_beam
@@ -183,14 +184,10 @@ def capacity_changes(
     """
     base = DetectorConfig() if base is None else base
     capacity = fitting_capacity(max(len(xyz) for xyz in sweeps))
-    usual = {
-        "clustering.max_obstacles": base.clustering.max_obstacles or 3 * capacity // 4,
-        "box.max_slab_points": base.box.max_slab_points or capacity // 4,
-    }
-    usual |= {f"clustering.maps.{i}.max_cells": m.max_cells for i, m in enumerate(base.clustering.maps)}
+    sizes = capacity_sizes(base, capacity)
     needed = changed_fields(propose_capacities(sweeps, base=base, margin=1), base)
     proposed = changed_fields(propose_capacities(sweeps, base=base), base)
-    return {name: proposed[name] for name, value in needed.items() if value > usual[name]}
+    return {name: proposed[name] for name, value in needed.items() if value > sizes.get(name, value)}
 
 
 def print_sweep_info(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxbox.config import DEFAULT_SCORE_THRESHOLD, DetectorConfig
+from jaxbox.config.capacities import CAPACITIES, CLOUD_CAPACITY
 from jaxbox.config.schema import GROUND_CANDIDATE_CELL_M
 from jaxbox.types import NUM_POINT_COUNTS, Counts, Detections, GroundPlane, Label, Status
 
@@ -209,27 +210,12 @@ def summarise(
 
 def _capacities(counts: Counts, num_rows: int, config: DetectorConfig) -> Sequence[CapacityUse]:
     """Every capacity beside what it had to hold, in the order of the stages."""
-    obstacles = config.clustering.max_obstacles or -(-3 * num_rows // 4)
-    uses = [
-        CapacityUse("PointCloud.from_numpy(capacity=...)", counts.num_points, num_rows),
-        CapacityUse("clustering.max_obstacles", int(counts.obstacles), obstacles),
-    ]
-    for i, settings in enumerate(config.clustering.maps):
-        where = f"clustering.maps.{i}"
-        uses.append(CapacityUse(f"{where}.max_cells", int(counts.cells[i]), settings.max_cells))
-        uses.append(CapacityUse(f"{where}.max_clusters", int(counts.clusters[i]), settings.max_clusters))
-    if config.box.fit_to == "slab":
-        slab = config.box.max_slab_points or -(-num_rows // 4)
-        uses.append(CapacityUse("box.max_slab_points", int(counts.slab_points), slab))
-    vehicles = config.vehicles
-    return [
-        *uses,
-        CapacityUse("vehicles.max_large", int(counts.large_clusters), vehicles.max_large),
-        CapacityUse("completion.max_assignments", int(counts.assignments), config.completion.max_assignments),
-        CapacityUse("vehicles.max_candidates", int(counts.candidates), vehicles.max_candidates),
-        CapacityUse("vehicles.max_detections", int(counts.detections), vehicles.max_detections),
-        CapacityUse("hull.max_vertices", int(counts.hull_vertices), config.hull.max_vertices),
-    ]
+    uses = [CapacityUse(CLOUD_CAPACITY, counts.num_points, num_rows)]
+    for row in CAPACITIES:
+        sizes = row.sizes(config, num_rows)
+        needed = np.atleast_1d(getattr(counts, row.count))[: len(sizes)].tolist()
+        uses += [CapacityUse(name, n, size) for (name, size), n in zip(sizes.items(), needed, strict=True)]
+    return uses
 
 
 def _num_candidates(config: DetectorConfig) -> int:
