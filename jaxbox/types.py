@@ -21,6 +21,7 @@ import numpy as np
 
 from jaxbox._padding import aligned_empty, checked_points, fill_rows, fitting_capacity
 from jaxbox.config import DetectorConfig
+from jaxbox.config import Label as Label  # noqa: PLC0414 - one of the types that users hold
 from jaxbox.config.capacities import CAPACITIES, CLOUD_CAPACITY, Capacity
 
 GROUND_ABOVE_M = 0.5
@@ -70,14 +71,6 @@ _STATUS_TEXT = {
     "The sensor is mounted upside down, z points down, or the points are not in the sensor's frame; turn or "
     "move them first.",
 } | {bit: "; or ".join(row.overflow for row in rows) + "." for bit, rows in _OVERFLOW_ROWS.items()}
-
-
-class Label(enum.IntEnum):
-    """The vehicle classes, as stored in `Detections.label`."""
-
-    CAR = 0
-    VAN = 1
-    TRUCK = 2
 
 
 @jax.tree_util.register_dataclass

@@ -1,6 +1,6 @@
 """The detector's configuration: one sub-config a stage, the presets, and names for every field."""
 
-from jaxbox.config.class_priors import CAR, TRUCK, VAN, ClassPrior, Scalar
+from jaxbox.config.class_priors import ClassPrior, Label, Scalar
 from jaxbox.config.fitting import propose_capacities
 from jaxbox.config.presets import DetectorConfig
 from jaxbox.config.schema import (
@@ -18,10 +18,7 @@ from jaxbox.config.schema import (
 )
 
 __all__ = [
-    "CAR",
     "DEFAULT_SCORE_THRESHOLD",
-    "TRUCK",
-    "VAN",
     "BoxConfig",
     "ClassPrior",
     "ClusteringConfig",
@@ -32,6 +29,7 @@ __all__ = [
     "FilterConfig",
     "GroundConfig",
     "HullConfig",
+    "Label",
     "RegionConfig",
     "Scalar",
     "VehicleConfig",

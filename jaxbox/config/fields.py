@@ -242,14 +242,15 @@ def _flatten(node: Any, name: str, values: dict[str, Any], lengths: dict[str, in
 
 def _resized(config: DetectorConfig, name: str, length: int) -> DetectorConfig:
     """A tuple of sub-configs of another length."""
-    node, items = None, config
+    items: Any = config
     steps = name.split(".")
     for step in steps:
-        node, items = items, getattr(items, step, None)
+        items = getattr(items, step, None)
     if not isinstance(items, tuple) or not items:
         lists = dict.fromkeys(leaf.partition(".0.")[0] for leaf, _ in _leaves(config) if ".0." in leaf)
         raise ValueError(f"{name} is no list; nearest lists are {nearest_fields(name, lists)}.")
-    is_open = Ellipsis in typing.get_args(typing.get_type_hints(type(node))[steps[-1]])
+    # Another class would have no defaults to begin with: there are as many as labels.
+    is_open = all(field.default is not dataclasses.MISSING for field in dataclasses.fields(items[0]))
     if length < 1 or (length != len(items) and not is_open):
         wanted = "at least 1" if is_open else str(len(items))
         raise ValueError(f"{name} has {length} entries; it must have {wanted}.")

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar, dataclass_transform
 
 import jax
 
-from jaxbox.config.class_priors import CAR, TRUCK, VAN, ClassPrior, Scalar
+from jaxbox.config.class_priors import ClassPrior, Label, Scalar
 
 _T = TypeVar("_T")
 
@@ -289,16 +289,16 @@ class VehicleConfig:
     surroundings: bool = _static(default=True)
     """static: judge a box, and measure its height, by all points in and round it; False keeps the height of
     the cluster, and lets nothing round the box count (the paper)."""
-    classes: tuple[ClassPrior, ClassPrior, ClassPrior] = (CAR, VAN, TRUCK)
-    """Priors of car, van and truck."""
+    classes: tuple[ClassPrior, ...] = tuple(label.prior for label in Label)
+    """Priors of the classes, in the order of `Label`."""
     large_height_m: Scalar = 1.7
-    """Clusters higher than this are also tried as a van or a truck."""
+    """Clusters higher than this are also tried as a van, a truck and so on."""
     large_min_points: Scalar = 20.0
     """Clusters with fewer points are not: there would be too little to tell a van from a bush."""
     large_clearance_m: Scalar = 0.8
     """Clusters that begin higher than this above the ground are not: they are trees, say."""
     max_large: int = _static(default=768)
-    """static: capacity for clusters also tried as a van or a truck."""
+    """static: capacity for clusters also tried as a van, a truck and so on."""
     max_candidates: int = _static(default=1024)
     """static: capacity for boxes that pass the gates, before suppression."""
     max_detections: int = _static(default=128)

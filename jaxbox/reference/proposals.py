@@ -182,7 +182,7 @@ def _outline(members: np.ndarray, obstacles: Obstacles, config: Any) -> np.ndarr
 
 
 def is_large(proposal: Proposal, config: Any) -> bool:
-    """Whether a cluster is tried as a van and a truck too: high, and standing on the ground.
+    """Whether a cluster is tried as the larger classes too: high, and standing on the ground.
 
     Args:
       proposal: the cluster.
@@ -261,7 +261,7 @@ def _preference(proposals: list[Proposal], evidence: Evidence | None, config: An
 def judge_candidates(
     proposals: list[list[Proposal]], obstacles: Obstacles, evidence: Evidence | None, config: Any
 ) -> tuple[list[Candidate], int]:
-    """Scores every proposal as a car, and the high ones as a van and as a truck too.
+    """Scores every proposal as a car, and the high ones as each other class too.
 
     Args:
       proposals: of each map; the first also gives the scene's direction.
@@ -278,9 +278,8 @@ def judge_candidates(
     every = [proposal for of_map in proposals for proposal in of_map]
     large = [p for p in every if is_large(p, config)][: vehicles.max_large]
     candidates, num_assignments = [], 0
-    for label, chosen in ((Label.CAR, every), (Label.VAN, large), (Label.TRUCK, large)):
-        prior = vehicles.classes[label]
-        for proposal in chosen:
+    for label, prior in zip(Label, vehicles.classes, strict=True):
+        for proposal in every if label is Label.CAR else large:
             readings = [_reading(proposal, preference)]
             if not _is_tall(proposal, readings[0], config):
                 continue

@@ -109,7 +109,9 @@ def classes_in_words(labels: np.ndarray) -> str:
     """
     counts = collections.Counter(Label(label) for label in labels.tolist())
     return ", ".join(
-        f"{counts[label]} {label.name.lower()}{'s' * (counts[label] > 1)}" for label in Label if counts[label]
+        f"{counts[label]} {label.plural if counts[label] > 1 else label.word}"
+        for label in Label
+        if counts[label]
     )
 
 
@@ -128,7 +130,7 @@ class Summary:
     num_boxes: int
     """Boxes from `min_score` on."""
     boxes: dict[str, int]
-    """Those by class: "car", "van" and "truck"."""
+    """Those by class, each a `Label.word` such as "car"."""
     min_score: float
     """The cut."""
     score: Spread
@@ -197,7 +199,7 @@ def summarise(
         capacities=tuple(_capacities(counts, detections.ground_mask.shape[-1], config)),
         status=Status(int(detections.status)),
         num_boxes=int(keep.sum()),
-        boxes={kind.name.lower(): int((label == kind).sum()) for kind in Label},
+        boxes={kind.word: int((label == kind).sum()) for kind in Label},
         min_score=min_score,
         score=Spread.of(score[keep]),
         range_m=Spread.of(np.hypot(center[:, 0], center[:, 1])),
