@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks import bench_accuracy, common
 from jaxbox import DetectorConfig
-from jaxbox.config.fields import replace_settings
+from jaxbox.config.fields import replace_fields
 from jaxbox.evaluation.copies import COPIES, Copy, Frame, label_points, read_frame
 from jaxbox.io import open_sweeps
 
@@ -83,7 +83,7 @@ ABLATIONS = (
     Ablation("no ring, no overhead penalty", {"vehicles.ring_weight": 0.0, "vehicles.overhead_weight": 0.0}),
     Ablation("no ring penalty", {"vehicles.ring_weight": 0.0}),
     Ablation("no overhead penalty", {"vehicles.overhead_weight": 0.0}),
-    Ablation("upright things not told from cars", {"vehicles.upright_worth": 1.0}),
+    Ablation("upright things not told from cars", {"vehicles.upright_score": 1.0}),
     Ablation("vans from 2.0 m on", {"vehicles.classes.1.min_height_m": 2.0}),
     Ablation("no ground support", {"vehicles.support_points": 1 / NO_LIMIT}),
     Ablation("no sparseness", {"vehicles.sparseness_power": 0.0}),
@@ -138,7 +138,7 @@ def measure(
     num_points = {frame.name: label_points(frame) for frame in frames}
     table: dict[str, dict[str, Any]] = {}
     for ablation in (Ablation(FULL, {}), *ablations):
-        config = replace_settings(base, ablation.changes)
+        config = replace_fields(base, ablation.changes)
         by_copy, statuses = {}, []
         for copy in copies:
             by_copy[copy.name], bits = copy_figures(frames, num_points, copy, config)

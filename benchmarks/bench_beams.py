@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks import common
 from benchmarks.bench_accuracy import MIN_OVERLAP, RECALLS
 from benchmarks.bench_sensors import RIGHT_OVERLAP
-from jaxbox import DEFAULT_CUT, DetectorConfig, Label
+from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig, Label
 from jaxbox._padding import fitting_capacity
 from jaxbox.config.sensors import TUNED_BEAMS
 from jaxbox.evaluation import Selection, kitti, matching, pairwise_overlaps, report, thin_beams
@@ -96,7 +96,7 @@ def measure_synthetic(
     for sweep in sweeps:
         keep = thin_beams(sweep.xyz, num_beams=DENSEST, keep_every=DENSEST // num_beams)
         answer = common.detect(sweep.xyz[keep], sweep.intensity[keep], config)
-        acted_on = np.asarray(answer.valid) & (np.asarray(answer.score) >= DEFAULT_CUT)
+        acted_on = np.asarray(answer.valid) & (np.asarray(answer.score) >= DEFAULT_SCORE_THRESHOLD)
         rows = np.column_stack([answer.center, answer.size, answer.yaw]).astype(float)[acted_on]
         boxes = sweep.boxes
         truth = np.column_stack([boxes.center, boxes.size, boxes.yaw])
@@ -160,7 +160,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     tables = {"kitti": run_kitti(options), "synthetic": run_synthetic(options)}
     for title, key in (
         ("KITTI thinned: Car, moderate, R40 at IoU 0.7", "kitti"),
-        (f"synthetic streets: cars, BEV IoU {SYNTHETIC_OVERLAP}, from a score of {DEFAULT_CUT}", "synthetic"),
+        (
+            f"synthetic streets: cars, BEV IoU {SYNTHETIC_OVERLAP}, "
+            f"from a score of {DEFAULT_SCORE_THRESHOLD}",
+            "synthetic",
+        ),
     ):
         print(f"\n{title}")
         common.print_table(list(tables[key][0]), [list(row.values()) for row in tables[key]])

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import common
-from jaxbox import DEFAULT_CUT, DetectorConfig
+from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig
 from jaxbox._padding import fitting_capacity
 from jaxbox.evaluation import Selection, kitti, matching
 from jaxbox.evaluation.copies import COPIES, Copy, Frame, detect_copy, read_frame
@@ -36,8 +36,8 @@ MIN_OVERLAP = {"Car": kitti.MIN_OVERLAP["Car"]}
 RECALL_OVERLAP = 0.5
 COLUMNS = ("3d", "bev", "image", "SOFT", "recall", "recall at the cut", "false a frame", "length", "height")
 """AP at IoU .7 (R40, moderate), SOFT, and at BEV IoU .5 the recall of moderate cars by boxes of any score and
-by those from `jaxbox.DEFAULT_CUT` on, how many of the latter a frame match no label, and by how much (m) the
-boxes found are on average too long and too high."""
+by those from `jaxbox.DEFAULT_SCORE_THRESHOLD` on, how many of the latter a frame match no label, and by how
+much (m) the boxes found are on average too long and too high."""
 PLOTTED = {"3d": "3D AP", "SOFT": "SOFT", "recall": "recall, BEV .5 (%)"}
 
 
@@ -83,7 +83,7 @@ def score(labels: kitti.Objects, results: kitti.Objects) -> dict[str, float]:
     ap = {curve.metric: curve.r40 for curve in curves if curve.difficulty == "moderate"}
     scenes = matching.select(labels, results, Selection(difficulty="moderate"))
     every = matching.rates(scenes, metric="bev", min_overlap=RECALL_OVERLAP)
-    cut = matching.cut(scenes, min_score=DEFAULT_CUT)
+    cut = matching.cut(scenes, min_score=DEFAULT_SCORE_THRESHOLD)
     kept = matching.rates(cut, metric="bev", min_overlap=RECALL_OVERLAP)
     found = matching.matched_boxes(scenes, min_overlap=RECALL_OVERLAP)
     # Without a match there is no error to report.

@@ -120,7 +120,7 @@ def estimate(sighting: Sighting, found: Detections) -> dict[str, Any]:
         "box_iou": float(box[0, best]),
         "yaw_error_deg": float(np.degrees(turn)),
         "score": float(np.asarray(found.score)[valid][best]),
-        "label": Label(int(np.asarray(found.label)[valid][best])).name.lower(),
+        "label": Label(int(np.asarray(found.label)[valid][best])).word,
     }
 
 

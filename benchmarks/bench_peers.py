@@ -28,7 +28,7 @@ import numpy as np
 import jaxbox
 from benchmarks import common
 from benchmarks.peers.chains import PEERS, Answer, Chain, PclProcess, make_peers
-from jaxbox import DEFAULT_CUT, DetectorConfig, PointCloud, reference
+from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig, PointCloud, reference
 from jaxbox.evaluation.copies import Frame, label_points, read_frame
 from jaxbox.io import boxes_from_objects, open_sweeps
 
@@ -59,7 +59,7 @@ def jaxbox_chain(config: DetectorConfig) -> Chain:
         found = jaxbox.detect(PointCloud.from_numpy(xyz), config)
         wanted = (found.center, found.size, found.yaw, found.score, found.valid)
         center, size, yaw, score, valid = (np.asarray(array) for array in wanted)
-        keep = valid & (score >= DEFAULT_CUT)
+        keep = valid & (score >= DEFAULT_SCORE_THRESHOLD)
         boxes = np.column_stack([center[:, :2], size[:, :2], yaw])[keep]
         return Answer(int(found.counts.obstacles), int(np.max(found.counts.clusters)), boxes)
 
@@ -75,7 +75,7 @@ def reference_chain(config: DetectorConfig) -> Chain:
         return Answer(
             int(found.counts["obstacles"]),
             int(np.max(found.counts["clusters"])),
-            boxes[found.score >= DEFAULT_CUT],
+            boxes[found.score >= DEFAULT_SCORE_THRESHOLD],
         )
 
     return run

@@ -16,7 +16,7 @@ import numpy as np
 
 import jaxbox
 from jaxbox import Detections, DetectorConfig, PointCloud, Status
-from jaxbox.config.fields import parse_change, replace_settings
+from jaxbox.config.fields import parse_change, replace_fields
 from jaxbox.io import Sweep, atomic_writer, open_sweeps
 from jaxbox.run.cache import cache_folder, keep_compiled, make_private
 from jaxbox.run.processes import THREADS_VARIABLE
@@ -85,7 +85,7 @@ def chosen_config(options: argparse.Namespace, *, preset: str | None = None) -> 
     enable_cache()
     try:
         changes = dict(parse_change(change) for change in options.set)
-        return replace_settings(DetectorConfig.presets()[preset or options.preset], changes)
+        return replace_fields(DetectorConfig.presets()[preset or options.preset], changes)
     except ValueError as error:
         raise SystemExit(f"--set: {error}") from error
 

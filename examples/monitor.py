@@ -35,7 +35,7 @@ LIMITS = {
     "out_of_range_share": 0.2,  # a wrong frame or unit
     "ground_share": 0.2,  # a sensor that looks elsewhere, or is covered
     "ground_inlier_share": 0.2,
-    "boxes": 8.0,  # per sweep, from `jaxbox.DEFAULT_CUT` on
+    "boxes": 8.0,  # per sweep, from `jaxbox.DEFAULT_SCORE_THRESHOLD` on
 }
 """How far the fast mean of a signal may be from its slow mean."""
 MAX_CAPACITY_SHARE = 0.9

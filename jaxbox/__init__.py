@@ -1,7 +1,7 @@
 """jaxbox: training-free LiDAR vehicle detection as one compiled JAX function."""
 
 from jaxbox._version import __version__
-from jaxbox.config import DEFAULT_CUT, DetectorConfig, propose_capacities
+from jaxbox.config import DEFAULT_SCORE_THRESHOLD, DetectorConfig, propose_capacities
 from jaxbox.run import serialization as _serialization  # noqa: F401 - jax.export learns the types below
 from jaxbox.run.batching import detect_batch
 from jaxbox.run.cache import enable_cache
@@ -11,7 +11,7 @@ from jaxbox.run.summary import Summary, summarise
 from jaxbox.types import Calibration, Detections, GroundPlane, Hulls, Label, PointCloud, Status, stack_clouds
 
 __all__ = [
-    "DEFAULT_CUT",
+    "DEFAULT_SCORE_THRESHOLD",
     "Calibration",
     "Detections",
     "DetectorConfig",

@@ -12,6 +12,7 @@ Conventions, project-wide:
 
 import dataclasses
 import enum
+import functools
 from collections.abc import Sequence
 
 import jax
@@ -19,6 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbox._padding import aligned_empty, checked_points, fill_rows, fitting_capacity
+from jaxbox.config import DetectorConfig
+from jaxbox.config import Label as Label  # noqa: PLC0414 - one of the types that users hold
+from jaxbox.config.capacities import CAPACITIES, CLOUD_CAPACITY, Capacity
 
 GROUND_ABOVE_M = 0.5
 """A ground plane that passes so high over the origin lies above the sensor: where recordings are in their
@@ -48,8 +52,14 @@ class Status(enum.IntFlag):
         >>> Status.NO_GROUND.describe()
         ['NO_GROUND: no plane had enough support; heights are taken from the lowest candidate instead.']
         """
-        return [f"{bit.name}: {_STATUS_TEXT[bit]}" for bit in _STATUS_TEXT if bit in self]
+        return [f"{bit.name}: {_STATUS_TEXT[bit]}" for bit in Status if bit and bit in self]
 
+
+_OVERFLOW_ROWS = {
+    Status[name]: [row for row in CAPACITIES if row.status == name]
+    for name in dict.fromkeys(row.status for row in CAPACITIES)
+}
+"""The capacities of each bit that says that one was too small, see `jaxbox.config.capacities`."""
 
 _STATUS_TEXT = {
     Status.EMPTY: "no finite point lies within the region; there is nothing to detect.",
@@ -57,34 +67,10 @@ _STATUS_TEXT = {
     Status.POINT_OVERFLOW: "the sweep has more points than the cloud's capacity; the farthest "
     "were dropped. Use PointCloud.from_numpy(..., capacity=...) with a larger capacity.",
     Status.NO_GROUND: "no plane had enough support; heights are taken from the lowest candidate instead.",
-    Status.OBSTACLE_OVERFLOW: "more points above the ground than clustering.max_obstacles (or, for "
-    "the points a box is fitted to, box.max_slab_points); the last in the sweep's order were dropped.",
-    Status.CELL_OVERFLOW: "a component map has more runs of occupied cells than its max_cells; "
-    "points in runs beyond those of all maps belong to no cluster.",
-    Status.CLUSTER_OVERFLOW: "a component map has more clusters than its max_clusters, and those beyond it "
-    "were not examined; or more clusters are high than vehicles.max_large, and those beyond it were "
-    "tried as cars only.",
-    Status.ASSIGNMENT_OVERFLOW: "the evidence has more boxes to weigh, each side of a cluster's rectangle as "
-    "the length of each class, than completion.max_assignments; those of the clusters with the fewest points "
-    "were not weighed.",
-    Status.CANDIDATE_OVERFLOW: "more boxes scored well by rays and size than vehicles.max_candidates; "
-    "the lowest-scoring were dropped.",
-    Status.DETECTION_OVERFLOW: "more detections than vehicles.max_detections; "
-    "the lowest-scoring were dropped.",
-    Status.HULL_OVERFLOW: "a hull has more vertices than hull.max_vertices; "
-    "every so many were kept, evenly round the hull.",
     Status.GROUND_ABOVE: "the ground lies above the origin, so that vehicles hang from it and are not found. "
     "The sensor is mounted upside down, z points down, or the points are not in the sensor's frame; turn or "
     "move them first.",
-}
-
-
-class Label(enum.IntEnum):
-    """The vehicle classes, as stored in `Detections.label`."""
-
-    CAR = 0
-    VAN = 1
-    TRUCK = 2
+} | {bit: "; or ".join(row.overflow for row in rows) + "." for bit, rows in _OVERFLOW_ROWS.items()}
 
 
 @jax.tree_util.register_dataclass
@@ -340,6 +326,21 @@ class Counts:
         fields = dataclasses.fields(self)[:NUM_POINT_COUNTS]
         return sum(int(getattr(self, field.name)) for field in fields)
 
+    def overflows(self, config: DetectorConfig, num_rows: int) -> dict[Status, jax.Array]:
+        """Which capacities were too small; works on traced counts too.
+
+        Args:
+          config: the configuration that counted.
+          num_rows: N, capacity of the cloud.
+
+        Returns:
+          () bool for each bit of a capacity of the configuration: whether it is to be set.
+        """
+        return {
+            bit: functools.reduce(jnp.logical_or, [row.is_exceeded(self, config, num_rows) for row in rows])
+            for bit, rows in _OVERFLOW_ROWS.items()
+        }
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
@@ -399,49 +400,17 @@ class Detections:
           RuntimeError: one line a failure, with the configuration field and the size needed.
         """
         status = Status(int(self.status))
-        failures = [_overflow_text(bit, self.counts) for bit in _OVERFLOW_BITS if bit in status]
+        sizes = {Status.POINT_OVERFLOW: [f"{CLOUD_CAPACITY} must be at least {self.counts.num_points}"]}
+        sizes |= {bit: [_size_text(row, self.counts) for row in rows] for bit, rows in _OVERFLOW_ROWS.items()}
+        failures = [f"{bit.name}: {' and '.join(texts)}." for bit, texts in sizes.items() if bit in status]
         if failures:
             raise RuntimeError("\n".join(failures))
 
 
-_OVERFLOW_BITS = (
-    Status.POINT_OVERFLOW,
-    Status.OBSTACLE_OVERFLOW,
-    Status.CELL_OVERFLOW,
-    Status.CLUSTER_OVERFLOW,
-    Status.ASSIGNMENT_OVERFLOW,
-    Status.CANDIDATE_OVERFLOW,
-    Status.DETECTION_OVERFLOW,
-    Status.HULL_OVERFLOW,
-)
-
-
-def _overflow_text(bit: Status, counts: Counts) -> str:
-    per_map = {
-        Status.CELL_OVERFLOW: ("max_cells", counts.cells),
-        Status.CLUSTER_OVERFLOW: ("max_clusters", counts.clusters),
-    }
-    if bit in per_map:
-        field, needed = per_map[bit]
-        sizes = ", ".join(str(int(n)) for n in np.asarray(needed))
-        large = f" and vehicles.max_large at least {int(counts.large_clusters)}"
-        return (
-            f"{bit.name}: clustering.maps[i].{field} must be at least {sizes} (one number a map)"
-            f"{large if bit is Status.CLUSTER_OVERFLOW else ''}."
-        )
-    if bit is Status.OBSTACLE_OVERFLOW:
-        return (
-            f"{bit.name}: clustering.max_obstacles must be at least {int(counts.obstacles)} "
-            f"and box.max_slab_points at least {int(counts.slab_points)}."
-        )
-    field, needed = {
-        Status.POINT_OVERFLOW: ("PointCloud.from_numpy(capacity=...)", counts.num_points),
-        Status.ASSIGNMENT_OVERFLOW: ("completion.max_assignments", counts.assignments),
-        Status.CANDIDATE_OVERFLOW: ("vehicles.max_candidates", counts.candidates),
-        Status.DETECTION_OVERFLOW: ("vehicles.max_detections", counts.detections),
-        Status.HULL_OVERFLOW: ("hull.max_vertices", counts.hull_vertices),
-    }[bit]
-    return f"{bit.name}: {field} must be at least {int(needed)}."
+def _size_text(row: Capacity, counts: Counts) -> str:
+    """How large a capacity must be, in words."""
+    needed = ", ".join(str(int(n)) for n in np.atleast_1d(getattr(counts, row.count)))
+    return f"{row.field} must be at least {needed}{' (one number a map)' if row.is_per_map else ''}"
 
 
 @jax.tree_util.register_dataclass

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxbox import DEFAULT_CUT, Detections, DetectorConfig, Label, PointCloud, Status, synthetic
+from jaxbox import DEFAULT_SCORE_THRESHOLD, Detections, DetectorConfig, Label, PointCloud, Status, synthetic
 
 CAPACITY = 2**14
 """The smallest bucket, unless a case names another."""
@@ -110,7 +110,7 @@ def broken_laws(detections: Detections, xyz: np.ndarray, capacity: int, config: 
 
 def _box_laws(d: Detections, xyz: np.ndarray, config: DetectorConfig) -> dict[str, Any]:
     valid = np.asarray(d.valid)
-    share = np.where(d.score[valid] >= DEFAULT_CUT, 1, FAINT_SUPPORT)
+    share = np.where(d.score[valid] >= DEFAULT_SCORE_THRESHOLD, 1, FAINT_SUPPORT)
     support = box_support(d, xyz, config) / config.clustering.min_points
     rows = (d.center, d.size, d.yaw, d.score, d.label, d.num_points, d.hulls.num_vertices)
     return {
@@ -281,39 +281,44 @@ WORLDS = (
         "coplanar, upright",
         _fixed(_uniform([9, -20, -2], [9, 20, 6], 5000)),
         _both(LOST),
-        best_score=DEFAULT_CUT,
+        best_score=DEFAULT_SCORE_THRESHOLD,
     ),
-    Case("coplanar, at 20 degrees", _tilted, _both(LOST), best_score=DEFAULT_CUT),
+    Case("coplanar, at 20 degrees", _tilted, _both(LOST), best_score=DEFAULT_SCORE_THRESHOLD),
     Case("all ground", lambda: (synthetic.ground_only_sweep().xyz[::8], None), _both(OK), best_score=0),
     Case("no ground", lambda: (synthetic.no_ground_sweep().xyz[::8], None), _both(OK)),
     Case(
         "one wall",
         lambda: (synthetic.one_wall_sweep().xyz[::4], None),
         _each(OK, LOST),
-        best_score=DEFAULT_CUT,
+        best_score=DEFAULT_SCORE_THRESHOLD,
     ),
-    Case("sensor upside down", _turned_over, _both(ABOVE), best_score=DEFAULT_CUT),
+    Case("sensor upside down", _turned_over, _both(ABOVE), best_score=DEFAULT_SCORE_THRESHOLD),
     Case(
-        "sensor on its side", lambda: (street()[:, [0, 2, 1]], None), _each(OK, LOST), best_score=DEFAULT_CUT
+        "sensor on its side",
+        lambda: (street()[:, [0, 2, 1]], None),
+        _each(OK, LOST),
+        best_score=DEFAULT_SCORE_THRESHOLD,
     ),
     Case(
         "one beam",
         lambda: (street()[np.abs(street()[:, 2] + 0.9) < 0.05], None),
         _both(OK),
-        best_score=DEFAULT_CUT,
+        best_score=DEFAULT_SCORE_THRESHOLD,
     ),
     Case(
         "rounded to 1 m",
         lambda: (np.round(street()), None),
         _both(OK),
-        best_score=DEFAULT_CUT,
+        best_score=DEFAULT_SCORE_THRESHOLD,
     ),
-    Case("noise", _fixed(_uniform([-70] * 3, [70] * 3, 16000)), _both(LOST), best_score=DEFAULT_CUT),
+    Case(
+        "noise", _fixed(_uniform([-70] * 3, [70] * 3, 16000)), _both(LOST), best_score=DEFAULT_SCORE_THRESHOLD
+    ),
     Case(
         "dense noise",
         _fixed(_uniform([-15, -15, -2], [15, 15, 2], 16000)),
         _each(Status.OBSTACLE_OVERFLOW, OK),
-        best_score=DEFAULT_CUT,
+        best_score=DEFAULT_SCORE_THRESHOLD,
     ),
 )
 

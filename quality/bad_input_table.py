@@ -17,7 +17,7 @@ import jax
 import jaxbox
 from benchmarks import common
 from jaxbox import DetectorConfig, PointCloud, Status
-from jaxbox.config.fields import replace_settings
+from jaxbox.config.fields import replace_fields
 from jaxbox.types import NUM_POINT_COUNTS
 from quality import bad_input
 
@@ -25,7 +25,7 @@ from quality import bad_input
 def answer(case: bad_input.Case, preset: str, base: DetectorConfig) -> dict[str, Any]:
     """What one preset made of one input."""
     xyz, cloud = bad_input.pad(case)
-    config = replace_settings(base, case.changes)
+    config = replace_fields(base, case.changes)
     found = jax.device_get(jaxbox.detect(cloud, config))
     status = Status(int(found.status))
     broken = bad_input.broken_laws(found, xyz, case.capacity, config)
@@ -39,7 +39,7 @@ def answer(case: bad_input.Case, preset: str, base: DetectorConfig) -> dict[str,
         "points": len(xyz),
         "status": common.status_names([int(status)]),
         "boxes": int(found.valid.sum()),
-        "boxes_above_cut": int((found.score >= jaxbox.DEFAULT_CUT).sum()),
+        "boxes_above_cut": int((found.score >= jaxbox.DEFAULT_SCORE_THRESHOLD).sum()),
         "best_score": best,
         "least_support": int(bad_input.box_support(found, xyz, config).min(initial=len(xyz))),
         "counts": {place.name: int(getattr(found.counts, place.name)) for place in places},

@@ -242,7 +242,7 @@ def spread_over_keys(
         cloud = PointCloud.from_numpy(xyz)
         for rows in follow_objects([boxes_of(jaxbox.detect(cloud, config, key)) for key in keys]):
             there = ~np.isnan(rows[:, 7])
-            is_above = there & (np.nan_to_num(rows[:, 7]) >= jaxbox.DEFAULT_CUT)
+            is_above = there & (np.nan_to_num(rows[:, 7]) >= jaxbox.DEFAULT_SCORE_THRESHOLD)
             if is_above.any():
                 above.append(is_above.mean())
                 anywhere.append(there.mean())

@@ -22,7 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from jaxbox import DetectorConfig, io
 from jaxbox.cli.results import RunAccount
-from jaxbox.config.fields import settings_to_toml
+from jaxbox.config.fields import config_to_toml
 from jaxbox.io import foxglove
 from jaxbox.io.jsonl import JSONL
 from jaxbox.io.mcap_results import MCAP_RESULTS
@@ -437,7 +437,7 @@ TARGETS: Mapping[str, Target] = {
     ),
     "image": Target("a.png", io.read_image, lambda: written(write_image)),
     "config_toml": Target(
-        "a.toml", io.read_config, lambda: {"settings": settings_to_toml(DetectorConfig()).encode()}
+        "a.toml", io.read_config, lambda: {"settings": config_to_toml(DetectorConfig()).encode()}
     ),
     "config_json": Target(
         "a.json", io.read_config, lambda: {"settings": b'{"preset": "paper", "vehicles.min_score": 0.1}'}

@@ -9,7 +9,7 @@ import pytest
 
 from jaxbox import DetectorConfig
 from jaxbox.config.checks import check_config
-from jaxbox.config.fields import replace_settings
+from jaxbox.config.fields import replace_fields
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def bench(monkeypatch):
 def test_every_ablation_changes_the_default_preset_to_one_that_detect_takes(bench):
     seen = [DetectorConfig()]
     for ablation in bench.ABLATIONS:
-        config = replace_settings(DetectorConfig(), ablation.changes)
+        config = replace_fields(DetectorConfig(), ablation.changes)
         check_config(config)
         assert config not in seen, f"{ablation.name} repeats another row"
         seen.append(config)
@@ -30,7 +30,7 @@ def test_every_ablation_changes_the_default_preset_to_one_that_detect_takes(benc
 
 def test_most_ablations_share_the_compiled_program_of_the_preset(bench):
     static = jax.tree.structure(DetectorConfig())
-    changed = [replace_settings(DetectorConfig(), ablation.changes) for ablation in bench.ABLATIONS]
+    changed = [replace_fields(DetectorConfig(), ablation.changes) for ablation in bench.ABLATIONS]
     shared = [config for config in changed if jax.tree.structure(config) == static]
     assert len(shared) > len(changed) / 2
 

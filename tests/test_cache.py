@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import jaxbox
 from jaxbox import PointCloud
 from jaxbox.cli import app
-from jaxbox.config.fields import replace_settings
+from jaxbox.config.fields import replace_fields
 from jaxbox.run import cache, compiled, programs
 from jaxbox.run.cache import CacheFolders, CacheWarning, cache_folder, make_private
 from jaxbox.run.compiled import count_compilations
@@ -126,7 +126,7 @@ def test_detect_goes_through_what_is_kept_and_counts_it(tmp_path):
     assert_same_bits(jaxbox.detect_batch([cloud, cloud], devices=jax.devices()[:1])[1], expected)
     jax.eval_shape(jax.vmap(jaxbox.detect), jaxbox.stack_clouds([cloud, cloud]))
     assert count_compilations() == before + 1
-    blind = replace_settings(jaxbox.DetectorConfig(), {"evidence.enabled": False})
+    blind = replace_fields(jaxbox.DetectorConfig(), {"evidence.enabled": False})
     with pytest.raises(ValueError, match=r"evidence\.enabled"):
         jaxbox.detect(cloud, blind)
 

@@ -268,9 +268,9 @@ def test_info_of_few_points_and_capacities_that_do_not_fit():
     few = sweep_info.look_at("a", np.eye(3), np.zeros(3))
     assert (few.num_beams, few.sensor_height_m) == (None, None)
     assert "no ground plane" in "\n".join(sweep_info.describe(few))
-    assert sweep_info.fitting_settings([np.zeros((10, 3))]) == {}
+    assert sweep_info.capacity_changes([np.zeros((10, 3))]) == {}
     crowd = np.random.default_rng(0).uniform([-50, -50, -2], [50, 50, 2], (200_000, 3))
-    assert sweep_info.fitting_settings([crowd])["clustering.maps.0.max_cells"] > 14336
+    assert sweep_info.capacity_changes([crowd])["clustering.maps.0.max_cells"] > 14336
 
 
 def test_help_offers_completion_and_has_examples():

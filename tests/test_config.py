@@ -16,7 +16,7 @@ from jaxbox.config import (
     RegionConfig,
     propose_capacities,
 )
-from jaxbox.config.schema import CAPACITY_STEP
+from jaxbox.config.presets import CAPACITY_STEP
 from jaxbox.io import open_sweeps
 from jaxbox.synthetic import make_sweep
 
@@ -74,7 +74,7 @@ def test_the_paper_preset_is_the_papers():
     assert (paper.ground.max_planes, paper.ground.surface, paper.ground.candidates) == (1, False, "points")
     assert (paper.box.criterion, paper.box.fit_to) == ("area", "hull")
     assert (paper.completion.mode, paper.evidence.enabled) == ("none", False)
-    assert not paper.vehicles.surroundings
+    assert not paper.vehicles.neighbourhood
     assert paper.clustering.adaptive_growth == 0
     assert [m.num_levels for m in paper.clustering.maps] == [13]
 

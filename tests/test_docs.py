@@ -50,10 +50,10 @@ def rows_of(page):
 def test_the_page_of_settings_has_every_setting_its_default_and_whether_it_is_traced():
     config = DetectorConfig()
     rows = rows_of(hook("figures").settings())
-    traced = fields.traced_settings(config)
-    names = {name: re.sub(r"\.\d+\.", ".N.", name) for name in fields.all_settings(config)}
+    traced = fields.traced_fields(config)
+    names = {name: re.sub(r"\.\d+\.", ".N.", name) for name in fields.all_fields(config)}
     assert set(rows) == set(names.values())
-    for name, value in fields.all_settings(config).items():
+    for name, value in fields.all_fields(config).items():
         default, unit, kind, meaning = rows[names[name]]
         assert f"`{value}`" in default
         assert kind == ("traced" if name in traced else "static"), name

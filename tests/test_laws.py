@@ -17,7 +17,7 @@ from test_detector import CAPACITY, assert_same_bits, run
 from test_projection import make_calibration, oracle_uvw
 
 from jaxbox import DetectorConfig, PointCloud, Status, detect, detect_batch, io, stack_clouds, synthetic
-from jaxbox.config.fields import settings_from_toml, settings_to_toml
+from jaxbox.config.fields import config_from_toml, config_to_toml
 from jaxbox.evaluation import pairwise_overlaps
 from jaxbox.geometry.projection import project_boxes
 from jaxbox.io.kitti import KittiObject
@@ -350,4 +350,4 @@ def configurations(draw):
 
 @given(configurations(), st.sampled_from(sorted(DetectorConfig.presets())))
 def test_settings_written_and_read_are_the_settings_from_any_base(config, base):
-    assert settings_from_toml(settings_to_toml(config), base=DetectorConfig.presets()[base]) == config
+    assert config_from_toml(config_to_toml(config), base=DetectorConfig.presets()[base]) == config

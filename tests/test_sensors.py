@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from jaxbox import DEFAULT_CUT, DetectorConfig, io, synthetic
+from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig, io, synthetic
 from jaxbox.cli import app, sweep_info
-from jaxbox.cli.settings import chosen_config
-from jaxbox.config.fields import changed_settings, settings_from_toml
-from jaxbox.config.schema import CAPACITY_STEP
+from jaxbox.cli.config_options import chosen_config
+from jaxbox.config.fields import changed_fields, config_from_toml
+from jaxbox.config.presets import CAPACITY_STEP
 from jaxbox.config.sensors import SENSORS, fitting_sensor
 from jaxbox.evaluation import thin_beams
 
@@ -33,7 +33,7 @@ def test_a_sensor_changes_what_its_table_says_and_the_maps_capacities(preset, nu
     wanted = {
         f"{stage}.{name}": value for stage, row in sensor.changes.items() for name, value in row.items()
     }
-    changed = changed_settings(config, base)
+    changed = changed_fields(config, base)
     cells = {name: value for name, value in changed.items() if name.endswith(".max_cells")}
     assert {name: value for name, value in changed.items() if name not in cells} == wanted
     if num_beams == 64:
@@ -66,13 +66,13 @@ def test_a_settings_file_names_its_sensor_and_the_command_line_goes_before_it(tm
     file.write_text('preset = "fast"\nsensor = 16\nbox.slab_max_height_m = 0.7\n')
     fast16 = DetectorConfig.for_sensor(16, base=DetectorConfig.fast())
     expected = dataclasses.replace(fast16, box=dataclasses.replace(fast16.box, slab_max_height_m=0.7))
-    assert io.read_config(file) == settings_from_toml(file.read_text()) == expected
+    assert io.read_config(file) == config_from_toml(file.read_text()) == expected
     assert chosen_config(None, file, []) == expected
     # The file's changes come after the sensor, single changes after the file.
     config = chosen_config("default", file, ["vehicles.top_grade=0.02"], sensor=32)
     default32 = DetectorConfig.for_sensor(32)
     changes = {"box.slab_max_height_m": 0.7, "vehicles.top_grade": 0.02}
-    assert changed_settings(config, default32) == changes
+    assert changed_fields(config, default32) == changes
     # What is written is exact: it names every value and no sensor, so that reading it changes nothing.
     io.write_config(tmp_path / "exact.toml", config)
     assert io.read_config(tmp_path / "exact.toml") == config
@@ -155,7 +155,9 @@ def test_detect_sees_a_tilted_sweep_from_the_ground_upright(tmp_path):
         result = CliRunner().invoke(app, ["detect", *map(str, words)])
         assert result.exit_code == 0, result.output
         record = io.read_jsonl(tmp_path / name / "detections.jsonl")[0]
-        boxes[name] = np.array([b["center"] for b in record["boxes"] if b["score"] >= DEFAULT_CUT])
+        boxes[name] = np.array(
+            [b["center"] for b in record["boxes"] if b["score"] >= DEFAULT_SCORE_THRESHOLD]
+        )
     assert len(boxes["tilted"]) >= len(boxes["upright"]) - 1 >= 4
     # Of boxes worth acting on, at most one is another's: the points differ by a hair.
     distance = np.linalg.norm(boxes["tilted"][:, None] - boxes["upright"], axis=-1).min(axis=0)

@@ -52,7 +52,7 @@ def test_every_point_is_in_one_place_and_the_shares_sum_to_one(found):
 
 def test_boxes_are_those_from_the_cut_on(found):
     _, detections = found
-    for cut in (0.0, 0.05, jaxbox.DEFAULT_CUT):
+    for cut in (0.0, 0.05, jaxbox.DEFAULT_SCORE_THRESHOLD):
         result = jaxbox.summarise(detections, min_score=cut)
         keep = detections.valid & (detections.score >= cut)
         assert result.num_boxes == keep.sum() == sum(result.boxes.values())
@@ -65,7 +65,7 @@ def test_boxes_are_those_from_the_cut_on(found):
         assert result.range_m.least == pytest.approx(
             np.linalg.norm(detections.center[keep, :2], axis=1).min()
         )
-    assert jaxbox.summarise(detections).min_score == jaxbox.DEFAULT_CUT
+    assert jaxbox.summarise(detections).min_score == jaxbox.DEFAULT_SCORE_THRESHOLD
 
 
 def test_no_box_above_the_cut_leaves_the_spreads_empty(found):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxbox.config import DetectorConfig
-from jaxbox.config.fields import replace_settings, traced_settings
+from jaxbox.config.fields import replace_fields, traced_fields
 from jaxbox.tuning import Axis, best_trial, default_axes, latin_hypercube, leave_one_out, parse_axis, refine
 from jaxbox.tuning.selection import NOISE, Trial, score_without
 
@@ -154,10 +154,10 @@ def test_the_default_space_is_of_traced_settings_round_the_base(name):
     axes = default_axes(config)
     assert len(axes) > 10
     for axis in axes:
-        assert axis.low < traced_settings(config)[axis.name] < axis.high
-        assert axis.value(0.5) == pytest.approx(traced_settings(config)[axis.name], rel=1e-3)
+        assert axis.low < traced_fields(config)[axis.name] < axis.high
+        assert axis.value(0.5) == pytest.approx(traced_fields(config)[axis.name], rel=1e-3)
     for changes in latin_hypercube(axes, 3, seed=0):
-        assert traced_settings(replace_settings(config, changes)) == traced_settings(config) | changes
+        assert traced_fields(replace_fields(config, changes)) == traced_fields(config) | changes
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,16 @@
 """Laws of the data: how a sweep is taken in, and what the status bits say."""
 
 import dataclasses
+import functools
 import itertools
+import operator
 import re
 
 import jax
 import numpy as np
 import pytest
 
-from jaxbox import Label, PointCloud, Status, detect, stack_clouds
+from jaxbox import Label, PointCloud, Status, detect, stack_clouds, summarise
 from jaxbox._padding import CAPACITY_BUCKETS
 from jaxbox.config import (
     BoxConfig,
@@ -22,6 +24,7 @@ from jaxbox.config import (
     HullConfig,
     VehicleConfig,
 )
+from jaxbox.config.capacities import CAPACITIES
 from jaxbox.synthetic import make_sweep
 
 POINTS = np.random.default_rng(0).normal(0, 20, (50, 3)).astype(np.float32)
@@ -266,6 +269,18 @@ def test_detections_on_the_host_are_numpy_arrays_of_the_same_numbers(rounds):
 def test_each_capacity_that_is_too_small_sets_its_bit(rounds):
     _, detections = rounds[0]
     assert Status(int(detections.status)) == CAPACITY_BITS
+
+
+def test_a_capacity_is_told_full_exactly_where_it_is(rounds):
+    for config, detections in rounds:
+        uses = {use.field: use.dropped > 0 for use in summarise(detections, config).capacities}
+        full = Status.OK
+        for row in CAPACITIES:
+            if any(uses[name] for name in row.sizes(config, 2**14)):
+                full |= Status[row.status]
+        assert Status(int(detections.status)) == full
+        over = detections.counts.overflows(config, 2**14)
+        assert functools.reduce(operator.or_, [bit for bit in over if over[bit]], Status.OK) == full
 
 
 def test_the_error_of_a_full_capacity_names_its_field_and_the_true_count(rounds):

@@ -31,7 +31,7 @@ def found():
 
 def rows(detections):
     # The reference has no padding.
-    keep = np.asarray(detections.score) >= jaxbox.DEFAULT_CUT
+    keep = np.asarray(detections.score) >= jaxbox.DEFAULT_SCORE_THRESHOLD
     return np.column_stack([detections.center, detections.size, detections.yaw])[keep].astype(float)
 
 
@@ -64,7 +64,7 @@ def test_the_command_line_detects_and_writes(tmp_path):
     )
     assert result.exit_code == 0, result.output
     record = jaxbox.io.read_jsonl(tmp_path / "out" / "detections.jsonl")[0]
-    assert sum(box["score"] >= jaxbox.DEFAULT_CUT for box in record["boxes"]) >= NUM_FOUND
+    assert sum(box["score"] >= jaxbox.DEFAULT_SCORE_THRESHOLD for box in record["boxes"]) >= NUM_FOUND
 
 
 def parts(version):

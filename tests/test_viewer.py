@@ -36,7 +36,7 @@ from jaxbox.viewer import (
     Viewer,
     Wanted,
     build_scene,
-    settings_text,
+    config_text,
     words,
 )
 from jaxbox.viewer.frames import FAR_M
@@ -277,10 +277,10 @@ def test_the_copied_settings_are_read_back(preset, tmp_path):
     changes = {"vehicles.max_overlap": 0.25, "filtering.num_std": 3.0, "clustering.adaptive_growth": 0.001}
     wanted = Wanted(preset=preset, changes=changes)
     file = tmp_path / "copied.toml"
-    file.write_text(wanted.settings_text)
+    file.write_text(wanted.config_text)
     assert io.read_config(file) == wanted.config
     assert wanted.config != PRESETS[preset]
-    lines = [line for line in wanted.settings_text.splitlines() if not line.startswith("#")]
+    lines = [line for line in wanted.config_text.splitlines() if not line.startswith("#")]
     assert lines[0] == f'preset = "{preset}"'
     assert {line.split(" = ")[0] for line in lines[1:]} <= set(changes)
 
@@ -288,7 +288,7 @@ def test_the_copied_settings_are_read_back(preset, tmp_path):
 def test_settings_of_no_preset_are_copied_whole(tmp_path):
     given = propose_capacities([street(0).xyz], base=DetectorConfig.fast())
     file = tmp_path / "copied.toml"
-    file.write_text(settings_text(given, None, min_score=0.3))
+    file.write_text(config_text(given, None, min_score=0.3))
     assert io.read_config(file) == given
     assert "--min-score 0.3" in file.read_text()
     wish = view_command.initial_wish(given, min_score=0.3)

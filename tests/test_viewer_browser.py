@@ -10,7 +10,7 @@ from test_detector import street
 from viewer_sweeps import write_three_streets
 
 from jaxbox import DetectorConfig, PointCloud, detect, io
-from jaxbox.config.fields import settings_from_toml
+from jaxbox.config.fields import config_from_toml
 from jaxbox.viewer import View, Wanted, open_viewer
 from jaxbox.viz import BoxSet
 from jaxbox.viz.colors import ESTIMATE
@@ -134,7 +134,7 @@ def test_the_settings_are_copied_and_downloaded(visit, served, tmp_path):
     visit.press("copy")
     shown = visit.page.locator("[data-jaxbox=settings]")
     text = shown.input_value()
-    assert settings_from_toml(text) == viewer.wanted.config != DetectorConfig()
+    assert config_from_toml(text) == viewer.wanted.config != DetectorConfig()
     visit.page.locator("[data-jaxbox=settings] + button").click()
     visit.page.get_by_text("copied", exact=True).wait_for()
     assert visit.page.evaluate("navigator.clipboard.readText()") == text

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from jaxbox._version import __version__
+from jaxbox.cli.config_options import chosen_config, chosen_preset, complete_preset, complete_setting
 from jaxbox.cli.console import cache_warnings, input_errors, stdout
 from jaxbox.cli.demo import run_demo
 from jaxbox.cli.detect import DetectOptions, ResultFormat, run_detect
@@ -16,7 +17,6 @@ from jaxbox.cli.evaluate import run_eval
 from jaxbox.cli.export import Platform, run_export
 from jaxbox.cli.info import print_info
 from jaxbox.cli.report import SHOWN_MIN_SCORE
-from jaxbox.cli.settings import chosen_config, chosen_preset, complete_preset, complete_setting
 from jaxbox.cli.sweep_info import print_sweep_info
 from jaxbox.cli.threads import compute_on_one_thread
 from jaxbox.cli.tune import TuneOptions, run_tune

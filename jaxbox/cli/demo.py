@@ -86,7 +86,7 @@ def compare_with_truth(boxes: BoxSet, sweep: SyntheticSweep) -> Table:
     rows = []
     for row in np.argsort(distance):
         known = [
-            f"{Label(int(truth.label[row])).name.lower()} at {distance[row]:.0f} m",
+            f"{Label(int(truth.label[row])).word} at {distance[row]:.0f} m",
             str(truth.num_points[row]),
             f"{truth.visible[row]:.0%}",
         ]

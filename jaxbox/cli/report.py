@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from rich.table import Table
 
-from jaxbox.config import DEFAULT_CUT
+from jaxbox.config import DEFAULT_SCORE_THRESHOLD
 from jaxbox.run.summary import classes_in_words
 from jaxbox.types import Detections, Status
 
-SHOWN_MIN_SCORE = DEFAULT_CUT
+SHOWN_MIN_SCORE = DEFAULT_SCORE_THRESHOLD
 """Boxes that score less are written but not drawn or counted as found: most of them are no vehicle."""
 
 

@@ -10,7 +10,8 @@ from rich.console import Console
 from jaxbox import io
 from jaxbox._padding import fitting_capacity
 from jaxbox.config import DetectorConfig, propose_capacities
-from jaxbox.config.fields import changed_settings
+from jaxbox.config.capacities import capacity_sizes
+from jaxbox.config.fields import changed_fields
 from jaxbox.config.sensors import TUNED_BEAMS, fitting_sensor
 from jaxbox.evaluation.beams import beam_of_points, goes_beam_by_beam
 from jaxbox.geometry.mounting import MIN_SENSOR_HEIGHT_M, Mounting, measure_mounting
@@ -169,7 +170,7 @@ def fitting_beams(infos: Sequence[SweepInfo]) -> int:
     return fitting_sensor(float(np.median(spacings))) if spacings else TUNED_BEAMS
 
 
-def fitting_settings(
+def capacity_changes(
     sweeps: Sequence[np.ndarray], *, base: DetectorConfig | None = None
 ) -> dict[str, object]:
     """Capacities that sweeps need, as changes of a preset: none where it holds them.
@@ -183,14 +184,10 @@ def fitting_settings(
     """
     base = DetectorConfig() if base is None else base
     capacity = fitting_capacity(max(len(xyz) for xyz in sweeps))
-    usual = {
-        "clustering.max_obstacles": base.clustering.max_obstacles or 3 * capacity // 4,
-        "box.max_slab_points": base.box.max_slab_points or capacity // 4,
-    }
-    usual |= {f"clustering.maps.{i}.max_cells": m.max_cells for i, m in enumerate(base.clustering.maps)}
-    needed = changed_settings(propose_capacities(sweeps, base=base, margin=1), base)
-    proposed = changed_settings(propose_capacities(sweeps, base=base), base)
-    return {name: proposed[name] for name, value in needed.items() if value > usual[name]}
+    sizes = capacity_sizes(base, capacity)
+    needed = changed_fields(propose_capacities(sweeps, base=base, margin=1), base)
+    proposed = changed_fields(propose_capacities(sweeps, base=base), base)
+    return {name: proposed[name] for name, value in needed.items() if value > sizes.get(name, value)}
 
 
 def print_sweep_info(
@@ -219,7 +216,7 @@ def print_sweep_info(
     options = advised_options(infos, beams)
     if LEVEL_OPTION in options:
         clouds = [(measure_mounting(xyz) or Mounting()).raised().level(xyz) for xyz in clouds]
-    changes = fitting_settings(clouds, base=DetectorConfig.for_sensor(beams))
+    changes = capacity_changes(clouds, base=DetectorConfig.for_sensor(beams))
     capacity = fitting_capacity(max(len(xyz) for xyz in clouds))
     if as_json:
         found = [dataclasses.asdict(info) for info in infos]

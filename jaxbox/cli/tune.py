@@ -13,7 +13,7 @@ from jaxbox import tuning
 from jaxbox.cli.console import ExitCode, make_progress, print_error
 from jaxbox.cli.report import make_table
 from jaxbox.config import DetectorConfig
-from jaxbox.config.fields import PRESET_KEY, changed_settings
+from jaxbox.config.fields import PRESET_KEY, changed_fields
 from jaxbox.evaluation.copies import COPIES, Frame, read_frame
 from jaxbox.evaluation.objectives import OBJECTIVES
 from jaxbox.io import InputError, atomic_writer, open_sweeps, read_drives
@@ -74,7 +74,7 @@ def run_tune(labels: pathlib.Path, options: TuneOptions, console: Console) -> Ex
     with make_progress(shown=True) as progress:
         task = progress.add_task("tuning", total=options.trials * bench.sweeps_per_trial)
         try:
-            for trial in try_settings(bench, axes, options, lambda: progress.advance(task)):
+            for trial in run_trials(bench, axes, options, lambda: progress.advance(task)):
                 trials.append(trial)
                 write_trials(options.output / "trials.csv", bench, axes, trials)
                 best = tuning.best_trial(trials)
@@ -91,7 +91,7 @@ def run_tune(labels: pathlib.Path, options: TuneOptions, console: Console) -> Ex
         "interrupted": interrupted,
         "num_planned": options.trials,
         "preset": options.preset,
-        "base_changes": changed_settings(options.config, DetectorConfig.presets()[options.preset]),
+        "base_changes": changed_fields(options.config, DetectorConfig.presets()[options.preset]),
         "drives": None if options.drives is None else options.drives.name,
         "seed": options.seed,
         "compile_s": compile_s,
@@ -144,7 +144,7 @@ def _groups(frames: Sequence[Frame], drives: pathlib.Path | None) -> dict[str, s
     return {name: name for name in names} if drives is None else read_drives(drives, names)
 
 
-def try_settings(
+def run_trials(
     bench: Bench, axes: Sequence[Axis], options: TuneOptions, on_sweep: Callable[[], None]
 ) -> Iterator[Trial]:
     """The base, settings spread evenly over the space, then steps round the best of these.

@@ -22,7 +22,7 @@ from jaxbox.cluster.store import Store
 from jaxbox.cluster.worker import REPORT_KEY, SUFFIX, Partition, PartitionWorker, Task, is_attempt
 from jaxbox.config import DetectorConfig
 from jaxbox.config.checks import check_config
-from jaxbox.config.fields import differing_names, recorded_options, settings_from_toml, settings_to_toml
+from jaxbox.config.fields import config_from_toml, config_to_toml, differing_names, recorded_options
 from jaxbox.io._extras import require
 from jaxbox.run.cache import CacheFolders
 from jaxbox.run.versions import versions
@@ -195,7 +195,7 @@ class _Run:
         self._store.make()
         self._store.remove_partials()
         self._forget_attempts()
-        self._store.write_text(CONFIG, settings_to_toml(self.task.config))
+        self._store.write_text(CONFIG, config_to_toml(self.task.config))
         self._account(report, finished=False)
         try:
             # Closed at once where it is left early, so that Ray ends the workers.
@@ -230,7 +230,7 @@ class _Run:
             raise error.cause if isinstance(error.cause, io.InputError | OSError) else error from error
 
     def _plan(self, refs: list[SweepRef], size: int) -> list[Partition]:
-        decisive = [settings_to_toml(self.task.config), self._options]
+        decisive = [config_to_toml(self.task.config), self._options]
         groups = [tuple(refs[first : first + size]) for first in range(0, len(refs), size)]
         return [
             Partition(name=f"part-{number:06d}", key=_digest([*decisive, group]), refs=group)
@@ -263,7 +263,7 @@ class _Run:
         if text is None:
             return
         try:
-            earlier = settings_from_toml(text, base=self.task.config)
+            earlier = config_from_toml(text, base=self.task.config)
         except ValueError as error:
             raise io.InputError(f"{self.task.output}/{CONFIG}: {error}; give another output.") from error
         recorded = self._options
@@ -317,7 +317,7 @@ class _Run:
             "versions": self.task.versions,
             "inputs": self.inputs,
             "options": self._options,
-            "config": settings_to_toml(self.task.config),
+            "config": config_to_toml(self.task.config),
             "failures": report.failures,
             "deaths": report.deaths,
             "partitions": [dataclasses.asdict(part) for part in report.partitions],

@@ -1,14 +1,14 @@
 """The detector's configuration: one sub-config a stage, the presets, and names for every field."""
 
-from jaxbox.config.capacities import propose_capacities
-from jaxbox.config.class_priors import CAR, TRUCK, VAN, ClassPrior, Scalar
+from jaxbox.config.class_priors import ClassPrior, Label, Scalar
+from jaxbox.config.fitting import propose_capacities
+from jaxbox.config.presets import DetectorConfig
 from jaxbox.config.schema import (
-    DEFAULT_CUT,
+    DEFAULT_SCORE_THRESHOLD,
     BoxConfig,
     ClusteringConfig,
     CompletionConfig,
     ComponentMap,
-    DetectorConfig,
     EvidenceConfig,
     FilterConfig,
     GroundConfig,
@@ -18,10 +18,7 @@ from jaxbox.config.schema import (
 )
 
 __all__ = [
-    "CAR",
-    "DEFAULT_CUT",
-    "TRUCK",
-    "VAN",
+    "DEFAULT_SCORE_THRESHOLD",
     "BoxConfig",
     "ClassPrior",
     "ClusteringConfig",
@@ -32,6 +29,7 @@ __all__ = [
     "FilterConfig",
     "GroundConfig",
     "HullConfig",
+    "Label",
     "RegionConfig",
     "Scalar",
     "VehicleConfig",

@@ -1,124 +1,195 @@
-"""A rough look at sample sweeps in NumPy: how much each capacity of the detector has to hold."""
+"""The one table of capacities: where each is set, what counts its need, and what says that it was full.
+
+Whoever sizes an array, sets a status bit, words an error or reports how full a capacity was reads a row here.
+Capacities are Python numbers and counts may be traced, so that all of it works under `jax.jit`.
+"""
 
 import dataclasses
-from collections.abc import Iterable
+import fractions
+import math
+from typing import Any
 
-import numpy as np
+import jax
+import jax.numpy as jnp
 
-from jaxbox.config.schema import (
-    BoxConfig,
-    ClusteringConfig,
-    ComponentMap,
-    DetectorConfig,
-    GroundConfig,
-    rounded_up,
-    with_max_cells,
+from jaxbox.config.presets import DetectorConfig
+
+CLOUD_CAPACITY = "PointCloud.from_numpy(capacity=...)"
+"""What sets N, the one capacity that is not of the configuration, and no row here; `Status.POINT_OVERFLOW`
+says that it was too small."""
+PER_MAP = "clustering.maps[i]."
+"""How the field of a capacity begins that each component map has for itself."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Capacity:
+    """One row of the table."""
+
+    field: str
+    """Where it is set: a name in `DetectorConfig`, after `PER_MAP` one of each component map."""
+    count: str
+    """The field of `jaxbox.types.Counts` that counts what it had to hold: () or, one a map, (maps,)."""
+    status: str
+    """Name of the bit of `jaxbox.Status` that says that it was too small; two capacities may share one."""
+    overflow: str
+    """That sentence, in words."""
+    share: fractions.Fraction | None = None
+    """Of the cloud's capacity N: what None in the configuration stands for, rounded up."""
+    only_if: tuple[str, Any] | None = None
+    """A field and the value with which the capacity is used at all; None where it always is."""
+
+    @property
+    def is_per_map(self) -> bool:
+        """Whether each component map has its own."""
+        return self.field.startswith(PER_MAP)
+
+    def sizes(self, config: DetectorConfig, num_rows: int) -> dict[str, int]:
+        """How much it holds.
+
+        Args:
+          config: the configuration.
+          num_rows: N, capacity of the cloud.
+
+        Returns:
+          By dotted name: one number or, in the maps' order, one a map; none where it is not used.
+
+        >>> CAPACITIES[0].sizes(DetectorConfig(), 1001)
+        {'clustering.max_obstacles': 751}
+        """
+        if self.only_if is not None and _value(config, self.only_if[0]) != self.only_if[1]:
+            return {}
+        if not self.is_per_map:
+            size = _value(config, self.field)
+            return {self.field: self._share_of(num_rows) if size is None else size}
+        name = self.field.removeprefix(PER_MAP)
+        return {f"clustering.maps.{i}.{name}": getattr(m, name) for i, m in enumerate(config.clustering.maps)}
+
+    def _share_of(self, num_rows: int) -> int:
+        assert self.share is not None, f"{self.field} is None, and the table says no share of the cloud"
+        return math.ceil(self.share * num_rows)
+
+    def is_exceeded(self, counts: Any, config: DetectorConfig, num_rows: int) -> jax.Array:
+        """Whether more was there than it holds, in any map.
+
+        Args:
+          counts: `jaxbox.types.Counts` of a sweep, traced or not.
+          config: the configuration that counted.
+          num_rows: N, capacity of the cloud.
+
+        Returns:
+          () bool; False where the capacity is not used.
+        """
+        needed, sizes = getattr(counts, self.count), list(self.sizes(config, num_rows).values())
+        if not sizes:
+            return jnp.zeros((), bool)
+        return jnp.any(needed > jnp.array(sizes, jnp.int32)) if self.is_per_map else needed > sizes[0]
+
+
+CAPACITIES = (
+    Capacity(
+        field="clustering.max_obstacles",
+        count="obstacles",
+        status="OBSTACLE_OVERFLOW",
+        overflow="more points are above the ground than clustering.max_obstacles, and the last in the "
+        "sweep's order were dropped",
+        share=fractions.Fraction(3, 4),
+    ),
+    Capacity(
+        field=f"{PER_MAP}max_cells",
+        count="cells",
+        status="CELL_OVERFLOW",
+        overflow="a component map has more runs of occupied cells than its max_cells, and points in runs "
+        "beyond those of all maps belong to no cluster",
+    ),
+    Capacity(
+        field=f"{PER_MAP}max_clusters",
+        count="clusters",
+        status="CLUSTER_OVERFLOW",
+        overflow="a component map has more clusters than its max_clusters, and those beyond it were not "
+        "examined",
+    ),
+    Capacity(
+        field="box.max_slab_points",
+        count="slab_points",
+        status="OBSTACLE_OVERFLOW",
+        overflow="boxes are fitted to more points of a map than box.max_slab_points, and the last in the "
+        "sweep's order were dropped",
+        share=fractions.Fraction(1, 4),
+        only_if=("box.fit_to", "slab"),
+    ),
+    Capacity(
+        field="vehicles.max_large",
+        count="large_clusters",
+        status="CLUSTER_OVERFLOW",
+        overflow="more clusters are high than vehicles.max_large, and those beyond it were tried as cars "
+        "only",
+    ),
+    Capacity(
+        field="completion.max_assignments",
+        count="assignments",
+        status="ASSIGNMENT_OVERFLOW",
+        overflow="the evidence has more boxes to weigh, each side of a cluster's rectangle as the length of "
+        "each class, than completion.max_assignments, and those of the clusters with the fewest points were "
+        "not weighed",
+    ),
+    Capacity(
+        field="vehicles.max_candidates",
+        count="candidates",
+        status="CANDIDATE_OVERFLOW",
+        overflow="more boxes scored well by rays and size than vehicles.max_candidates, and the "
+        "lowest-scoring were dropped",
+    ),
+    Capacity(
+        field="vehicles.max_detections",
+        count="detections",
+        status="DETECTION_OVERFLOW",
+        overflow="more detections than vehicles.max_detections, and the lowest-scoring were dropped",
+    ),
+    Capacity(
+        field="hull.max_vertices",
+        count="hull_vertices",
+        status="HULL_OVERFLOW",
+        overflow="a hull has more vertices than hull.max_vertices, and every so many were kept, evenly round "
+        "it",
+    ),
 )
+"""Every capacity of the configuration, in the order of the stages."""
 
 
-def propose_capacities(
-    sweeps: Iterable[np.ndarray], base: DetectorConfig | None = None, *, margin: float = 1.25
-) -> DetectorConfig:
-    """Proposes capacities for sweeps like these, from a rough look at each.
-
-    The ground is taken to be the lowest point within a metre or two; the points above it, those that
-    boxes are fitted to and the occupied cells of each map are counted. It is a proposal, not a bound:
-    `Detections.raise_if_failed` checks each sweep's answer, and names the size that was missing.
+def capacity_sizes(config: DetectorConfig, num_rows: int) -> dict[str, int]:
+    """Every capacity that a configuration uses, by dotted name.
 
     Args:
-      sweeps: at least one (n, 3) array, m, sensor frame; NaN and infinity are ignored.
-      base: where all else comes from; None for the default preset.
-      margin: the largest count of any sweep times this is proposed, at least 1.
+      config: the configuration.
+      num_rows: N, capacity of the cloud.
 
     Returns:
-      `base` with other clustering.max_obstacles, box.max_slab_points and max_cells of each map:
-      multiples of 1024, so that proposals from similar sweeps share one compile.
+      How much each holds, in the order of the stages.
 
-    Raises:
-      ValueError: for no sweeps, an array of another shape, or a margin below 1.
-
-    >>> propose_capacities([np.zeros((100, 3))]).box.max_slab_points
-    1024
+    >>> list(capacity_sizes(DetectorConfig.paper(), 2**17).items())[:2]
+    [('clustering.max_obstacles', 98304), ('clustering.maps.0.max_cells', 14336)]
     """
-    base = DetectorConfig() if base is None else base
-    if not margin >= 1:
-        raise ValueError(f"margin is {margin}; it must be at least 1.")
-    counts = [_rough_counts(base, index, xyz) for index, xyz in enumerate(sweeps)]
-    if not counts:
-        raise ValueError("there are no sweeps; pass at least one (n, 3) array.")
-    largest = np.maximum(margin * np.max(counts, axis=0), 1)
-    obstacles, slab, *cells = (rounded_up(size) for size in largest)
-    base = with_max_cells(base, cells)
-    return dataclasses.replace(
-        base,
-        clustering=dataclasses.replace(base.clustering, max_obstacles=obstacles),
-        box=dataclasses.replace(base.box, max_slab_points=slab),
-    )
+    return {name: size for row in CAPACITIES for name, size in row.sizes(config, num_rows).items()}
 
 
-def _rough_counts(config: DetectorConfig, index: int, xyz: np.ndarray) -> list[int]:
-    """Counts what the capacities of `propose_capacities` have to hold.
+def obstacle_capacity(config: DetectorConfig, num_rows: int) -> int:
+    """How many points above the ground a cloud of capacity N = num_rows may have."""
+    return _size_of("clustering.max_obstacles", config, num_rows)
 
-    Args:
-      config: heights, region and maps.
-      index: which sweep this is, for the error.
-      xyz: (n, 3) m, sensor frame; NaN and infinity are ignored.
 
-    Returns:
-      Points above the ground, points that boxes are fitted to, and runs of occupied cells of each map.
+def slab_capacity(config: DetectorConfig, num_rows: int) -> int:
+    """How many points between the slab's heights boxes are fitted to, for a cloud of capacity N = num_rows.
 
-    Raises:
-      ValueError: for another shape.
+    Only where ``box.fit_to`` is "slab".
     """
-    xyz = np.asarray(xyz)
-    if xyz.ndim != 2 or xyz.shape[1] != 3:
-        raise ValueError(f"sweep {index} has shape {xyz.shape}; it must be (n, 3). Pass points[:, :3].")
-    region = np.array([config.region.half_x_m, config.region.half_y_m])
-    within = np.isfinite(xyz).all(axis=1) & (np.abs(xyz[:, :2]) < region).all(axis=1)
-    xyz = xyz[within].astype(np.float64)
-    xy, height = xyz[:, :2], _rough_height(xyz)
-
-    def between(settings: GroundConfig | ComponentMap) -> np.ndarray:
-        return (height > settings.min_height_m) & (height < settings.max_height_m)
-
-    slab = (height > config.box.slab_min_height_m) & (height < config.box.slab_max_height_m)
-    drawn = _rough_warp(xy, config.clustering)
-    counts = [np.sum(between(config.ground)), np.sum(slab & between(config.ground))]
-    for m in config.clustering.maps:
-        level = np.minimum((height - m.min_height_m) // m.cell_m, m.num_levels - 1)
-        cells = np.unique(np.column_stack([drawn // m.cell_m, level])[between(m)], axis=0)
-        next_in_line = [0, 1, 0] if m.num_levels == 1 else [0, 0, 1]
-        counts.append(len(cells) - np.sum(np.all(np.diff(cells, axis=0) == next_in_line, axis=1)))
-    return [int(count) for count in counts]
+    return _size_of("box.max_slab_points", config, num_rows)
 
 
-def _rough_height(xyz: np.ndarray) -> np.ndarray:
-    """(n,) m: height over the lowest point of the 1 m cell and the eight round it."""
-    if len(xyz) == 0:
-        return np.zeros(0)
-    cell = np.floor(xyz[:, :2]).astype(int)
-    cell -= cell.min(axis=0)
-    lowest = np.full(cell.max(axis=0) + 3, np.inf)
-    for i, j in np.ndindex(3, 3):
-        np.minimum.at(lowest, (cell[:, 0] + i, cell[:, 1] + j), xyz[:, 2])
-    return xyz[:, 2] - lowest[cell[:, 0] + 1, cell[:, 1] + 1]
+def _size_of(name: str, config: DetectorConfig, num_rows: int) -> int:
+    (size,) = (row.sizes(config, num_rows)[name] for row in CAPACITIES if row.field == name)
+    return size
 
 
-def _rough_warp(xy: np.ndarray, settings: ClusteringConfig) -> np.ndarray:
-    """Far points drawn together as the maps draw them, so that beyond the start cells hold more."""
-    rho = np.linalg.norm(xy, axis=1)
-    beyond, growth = (
-        np.maximum(rho - settings.adaptive_start_m, 0),
-        max(float(settings.adaptive_growth), 1e-9),
-    )
-    return xy * (1 + (np.log1p(growth * beyond) / growth - beyond) / np.maximum(rho, 1e-9))[:, None]
-
-
-def obstacle_capacity(config: ClusteringConfig, num_rows: int) -> int:
-    """Capacity for points above the ground, of a cloud of so many rows."""
-    return config.max_obstacles or -(-3 * num_rows // 4)
-
-
-def slab_capacity(config: BoxConfig, num_rows: int) -> int:
-    """Capacity for the points that rectangles are fitted to, of a cloud of so many rows."""
-    return config.max_slab_points or -(-num_rows // 4)
+def _value(config: DetectorConfig, name: str) -> Any:
+    stage, field = name.split(".")
+    return getattr(getattr(config, stage), field)

@@ -1,6 +1,6 @@
 """Fields of the configuration that contradict each other."""
 
-from jaxbox.config.schema import DetectorConfig
+from jaxbox.config.presets import DetectorConfig
 
 
 def check_config(config: DetectorConfig) -> None:

@@ -4,8 +4,12 @@ Every field is compared with data, and is traced; lengths are metres.
 """
 
 import dataclasses
+import enum
 
 import jax
+
+_HISSING = ("s", "x", "z", "ch", "sh")
+"""Words that end so take -es in the plural."""
 
 Scalar = float | jax.Array
 """A traced threshold: a Python float, or an array scalar under `jax.vmap`."""
@@ -52,58 +56,93 @@ class ClassPrior:
     and fences are upright. -1 asks for nothing."""
 
 
-# Sizes are medians over the 7,481 KITTI object label files; gates and widths were chosen on KITTI.
-CAR = ClassPrior(
-    length_m=3.9,
-    width_m=1.63,
-    height_m=1.5,
-    length_below_m=0.8,
-    length_above_m=2.0,
-    width_tolerance_m=0.3,
-    height_below_m=0.3,
-    height_above_m=0.6,
-    min_height_m=1.0,
-    max_height_m=2.3,
-    max_length_m=6.5,
-    max_width_m=2.4,
-    min_box_height_m=1.48,
-    prior_weight=1.0,
-    count_max_height_m=2.2,
-    recess_m=0.3,
-)
-VAN = ClassPrior(
-    length_m=4.98,
-    width_m=1.88,
-    height_m=2.13,
-    length_below_m=0.8,
-    length_above_m=1.5,
-    width_tolerance_m=0.3,
-    height_below_m=0.35,
-    height_above_m=0.35,
-    min_height_m=2.2,
-    max_height_m=2.7,
-    max_length_m=7.5,
-    max_width_m=2.6,
-    min_box_height_m=1.8,
-    prior_weight=0.5,
-    count_max_height_m=2.7,
-    recess_m=0.15,
-)
-TRUCK = ClassPrior(
-    length_m=10.81,
-    width_m=2.63,
-    height_m=3.34,
-    length_below_m=5.0,
-    length_above_m=4.0,
-    width_tolerance_m=0.4,
-    height_below_m=0.8,
-    height_above_m=0.8,
-    min_height_m=2.4,
-    max_height_m=4.2,
-    max_length_m=18.0,
-    max_width_m=3.2,
-    min_box_height_m=2.6,
-    prior_weight=0.3,
-    count_max_height_m=4.2,
-    recess_m=-1.0,
-)
+class Label(enum.IntEnum):
+    """The vehicle classes, by the number that `Detections.label` holds: their places in this table.
+
+    All else asks it for names, numbers and priors, so that another class is another entry at the end. Every
+    cluster is tried as the first class, and only large clusters as the others too.
+
+    Sizes are medians over the 7,481 KITTI object label files; gates and widths were chosen on KITTI.
+
+    >>> Label.VAN, Label.VAN.word, Label.VAN.prior.length_m
+    (<Label.VAN: 1>, 'van', 4.98)
+    """
+
+    _value_: int
+    prior: ClassPrior
+    """Usual size, and gates."""
+
+    def __new__(cls, prior: ClassPrior) -> "Label":
+        """The next number, which knows its prior."""
+        label = int.__new__(cls, len(cls.__members__))
+        label._value_, label.prior = len(cls.__members__), prior
+        return label
+
+    @property
+    def word(self) -> str:
+        """The class in words and in files: "car", say."""
+        return self.name.lower()
+
+    @property
+    def plural(self) -> str:
+        """The word for several.
+
+        >>> Label.TRUCK.plural
+        'trucks'
+        """
+        return f"{self.word}es" if self.word.endswith(_HISSING) else f"{self.word}s"
+
+    CAR = ClassPrior(
+        length_m=3.9,
+        width_m=1.63,
+        height_m=1.5,
+        length_below_m=0.8,
+        length_above_m=2.0,
+        width_tolerance_m=0.3,
+        height_below_m=0.3,
+        height_above_m=0.6,
+        min_height_m=1.0,
+        max_height_m=2.3,
+        max_length_m=6.5,
+        max_width_m=2.4,
+        min_box_height_m=1.48,
+        prior_weight=1.0,
+        count_max_height_m=2.2,
+        recess_m=0.3,
+    )
+    VAN = ClassPrior(
+        length_m=4.98,
+        width_m=1.88,
+        height_m=2.13,
+        length_below_m=0.8,
+        length_above_m=1.5,
+        width_tolerance_m=0.3,
+        height_below_m=0.35,
+        height_above_m=0.35,
+        min_height_m=2.2,
+        max_height_m=2.7,
+        max_length_m=7.5,
+        max_width_m=2.6,
+        min_box_height_m=1.8,
+        prior_weight=0.5,
+        count_max_height_m=2.7,
+        recess_m=0.15,
+    )
+    TRUCK = ClassPrior(
+        length_m=10.81,
+        width_m=2.63,
+        height_m=3.34,
+        length_below_m=5.0,
+        length_above_m=4.0,
+        width_tolerance_m=0.4,
+        height_below_m=0.8,
+        height_above_m=0.8,
+        min_height_m=2.4,
+        max_height_m=4.2,
+        max_length_m=18.0,
+        max_width_m=3.2,
+        min_box_height_m=2.6,
+        prior_weight=0.3,
+        count_max_height_m=4.2,
+        recess_m=-1.0,
+    )

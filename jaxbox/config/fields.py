@@ -1,10 +1,10 @@
-"""Settings by dotted name, such as ``vehicles.ring_weight`` or ``clustering.maps.0.min_height_m``.
+"""Fields by dotted name, such as ``vehicles.ring_weight`` or ``clustering.maps.0.min_height_m``.
 
-A name is the path through `DetectorConfig`; a number picks an item of a tuple. A traced setting is a
+A name is the path through `DetectorConfig`; a number picks an item of a tuple. A traced field is a
 threshold that compiled code takes as an operand; a static one decides a shape and compiles anew.
 
 The same names are the keys of a settings file: tables are the stages, an array of tables is a tuple, and a
-dotted key reaches one value. `settings_to_toml` writes such a text, `settings_from_toml` reads it.
+dotted key reaches one value. `config_to_toml` writes such a text, `config_from_toml` reads it.
 """
 
 import ast
@@ -39,7 +39,7 @@ class _Leaf:
     hint: Any
 
 
-def traced_settings(config: DetectorConfig) -> dict[str, Any]:
+def traced_fields(config: DetectorConfig) -> dict[str, Any]:
     """Every traced setting by its dotted name, in the order of the stages.
 
     Args:
@@ -48,13 +48,13 @@ def traced_settings(config: DetectorConfig) -> dict[str, Any]:
     Returns:
       The thresholds; none of them recompiles `jaxbox.detect` when it moves.
 
-    >>> traced_settings(DetectorConfig())["ground.tolerance_m"]
+    >>> traced_fields(DetectorConfig())["ground.tolerance_m"]
     0.1
     """
     return {name: leaf.value for name, leaf in _leaves(config) if not leaf.static}
 
 
-def all_settings(config: DetectorConfig) -> dict[str, Any]:
+def all_fields(config: DetectorConfig) -> dict[str, Any]:
     """Every setting by its dotted name, the static ones too.
 
     Args:
@@ -63,13 +63,13 @@ def all_settings(config: DetectorConfig) -> dict[str, Any]:
     Returns:
       The values, in the order of the stages.
 
-    >>> all_settings(DetectorConfig.paper())["box.criterion"]
+    >>> all_fields(DetectorConfig.paper())["box.criterion"]
     'area'
     """
     return {name: leaf.value for name, leaf in _leaves(config)}
 
 
-def replace_settings(config: DetectorConfig, changes: Mapping[str, Any]) -> DetectorConfig:
+def replace_fields(config: DetectorConfig, changes: Mapping[str, Any]) -> DetectorConfig:
     """Changes settings by their dotted names.
 
     Args:
@@ -83,18 +83,18 @@ def replace_settings(config: DetectorConfig, changes: Mapping[str, Any]) -> Dete
       ValueError: naming the setting, where there is none of that name (with the nearest), or where it
         cannot take the value.
 
-    >>> replace_settings(DetectorConfig(), {"clustering.maps.1.cell_m": 0.3}).clustering.maps[1].cell_m
+    >>> replace_fields(DetectorConfig(), {"clustering.maps.1.cell_m": 0.3}).clustering.maps[1].cell_m
     0.3
     """
     leaves = dict(_leaves(config))
     for name, value in changes.items():
         if name not in leaves:
-            raise ValueError(f"there is no setting {name}; nearest are {nearest_settings(name, leaves)}.")
+            raise ValueError(f"there is no setting {name}; nearest are {nearest_fields(name, leaves)}.")
         config = _replaced(config, name.split("."), _checked_value(name, leaves[name], value))
     return config
 
 
-def apply_settings(config: DetectorConfig, tables: Mapping[str, Any]) -> DetectorConfig:
+def apply_tables(config: DetectorConfig, tables: Mapping[str, Any]) -> DetectorConfig:
     """Changes settings by nested tables, dotted names, or both, as a parsed settings file holds them.
 
     Args:
@@ -106,10 +106,10 @@ def apply_settings(config: DetectorConfig, tables: Mapping[str, Any]) -> Detecto
       The changed settings.
 
     Raises:
-      ValueError: naming the setting, as `replace_settings`.
+      ValueError: naming the setting, as `replace_fields`.
 
     >>> maps = [{"cell_m": 0.3}, {"cell_m": 0.6}]
-    >>> [m.cell_m for m in apply_settings(DetectorConfig(), {"clustering": {"maps": maps}}).clustering.maps]
+    >>> [m.cell_m for m in apply_tables(DetectorConfig(), {"clustering": {"maps": maps}}).clustering.maps]
     [0.3, 0.6]
     """
     values: dict[str, Any] = {}
@@ -117,10 +117,10 @@ def apply_settings(config: DetectorConfig, tables: Mapping[str, Any]) -> Detecto
     _flatten(tables, "", values, lengths)
     for name, length in lengths.items():
         config = _resized(config, name, length)
-    return replace_settings(config, values)
+    return replace_fields(config, values)
 
 
-def settings_from_toml(text: str, *, base: DetectorConfig | None = None) -> DetectorConfig:
+def config_from_toml(text: str, *, base: DetectorConfig | None = None) -> DetectorConfig:
     """Reads the text of a settings file.
 
     Args:
@@ -132,13 +132,13 @@ def settings_from_toml(text: str, *, base: DetectorConfig | None = None) -> Dete
       The settings.
 
     Raises:
-      ValueError: with the line where it is no TOML, or with the setting, as `replace_settings`.
+      ValueError: with the line where it is no TOML, or with the setting, as `replace_fields`.
 
-    >>> settings_from_toml("vehicles.max_overlap = 0.2").vehicles.max_overlap
+    >>> config_from_toml("vehicles.max_overlap = 0.2").vehicles.max_overlap
     0.2
     """
     tables = tomllib.loads(text)
-    return apply_settings(base_of(tables, preset=base), without_base(tables))
+    return apply_tables(base_of(tables, preset=base), without_base(tables))
 
 
 def base_of(
@@ -157,7 +157,7 @@ def base_of(
     Raises:
       ValueError: for an unknown name, or a number of beams without settings.
     """
-    preset = preset_settings(tables.get(PRESET_KEY, "default")) if preset is None else preset
+    preset = preset_config(tables.get(PRESET_KEY, "default")) if preset is None else preset
     sensor = tables.get(SENSOR_KEY) if sensor is None else sensor
     if sensor is None:
         return preset
@@ -171,7 +171,7 @@ def without_base(tables: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in tables.items() if name not in (PRESET_KEY, SENSOR_KEY)}
 
 
-def preset_settings(name: Any) -> DetectorConfig:
+def preset_config(name: Any) -> DetectorConfig:
     """A preset by its name.
 
     Args:
@@ -189,8 +189,8 @@ def preset_settings(name: Any) -> DetectorConfig:
     return presets[name]
 
 
-def settings_to_toml(config: DetectorConfig) -> str:
-    """Writes every setting, so that `settings_from_toml` makes the same settings from any base.
+def config_to_toml(config: DetectorConfig) -> str:
+    """Writes every setting, so that `config_from_toml` makes the same settings from any base.
 
     Args:
       config: the settings, each threshold one number.
@@ -198,7 +198,7 @@ def settings_to_toml(config: DetectorConfig) -> str:
     Returns:
       TOML: a table a stage, an array of tables for component maps and classes.
 
-    >>> settings_to_toml(DetectorConfig()).splitlines()[:3]
+    >>> config_to_toml(DetectorConfig()).splitlines()[:3]
     ['[region]', 'half_x_m = 80.0', 'half_y_m = 60.0']
     """
     tables: dict[tuple[str, ...], list[str]] = {}
@@ -242,14 +242,15 @@ def _flatten(node: Any, name: str, values: dict[str, Any], lengths: dict[str, in
 
 def _resized(config: DetectorConfig, name: str, length: int) -> DetectorConfig:
     """A tuple of sub-configs of another length."""
-    node, items = None, config
+    items: Any = config
     steps = name.split(".")
     for step in steps:
-        node, items = items, getattr(items, step, None)
+        items = getattr(items, step, None)
     if not isinstance(items, tuple) or not items:
         lists = dict.fromkeys(leaf.partition(".0.")[0] for leaf, _ in _leaves(config) if ".0." in leaf)
-        raise ValueError(f"{name} is no list; nearest lists are {nearest_settings(name, lists)}.")
-    is_open = Ellipsis in typing.get_args(typing.get_type_hints(type(node))[steps[-1]])
+        raise ValueError(f"{name} is no list; nearest lists are {nearest_fields(name, lists)}.")
+    # Another class would have no defaults to begin with: there are as many as labels.
+    is_open = all(field.default is not dataclasses.MISSING for field in dataclasses.fields(items[0]))
     if length < 1 or (length != len(items) and not is_open):
         wanted = "at least 1" if is_open else str(len(items))
         raise ValueError(f"{name} has {length} entries; it must have {wanted}.")
@@ -257,8 +258,8 @@ def _resized(config: DetectorConfig, name: str, length: int) -> DetectorConfig:
     return _replaced(config, steps, (items + more)[:length])
 
 
-def changed_settings(config: DetectorConfig, base: DetectorConfig) -> dict[str, Any]:
-    """What to change in a base to get some settings, the inverse of `replace_settings`.
+def changed_fields(config: DetectorConfig, base: DetectorConfig) -> dict[str, Any]:
+    """What to change in a base to get some settings, the inverse of `replace_fields`.
 
     Args:
       config: the settings.
@@ -290,7 +291,7 @@ def differing_names(
       Dotted names and names of options; empty where nothing differs.
     """
     other = [name for name, value in options.items() if recorded.get(name) != value]
-    return [*changed_settings(earlier, config), *other]
+    return [*changed_fields(earlier, config), *other]
 
 
 def recorded_options(account: str | bytes) -> Mapping[str, Any]:
@@ -345,7 +346,7 @@ def check_traced(config: DetectorConfig, name: str) -> None:
     leaves = dict(_leaves(config))
     if name in leaves and not leaves[name].static:
         return
-    nearest = nearest_settings(name, traced_settings(config))
+    nearest = nearest_fields(name, traced_fields(config))
     if name in leaves:
         raise ValueError(
             f"{name} is static: each value would compile the detector anew. "
@@ -354,7 +355,7 @@ def check_traced(config: DetectorConfig, name: str) -> None:
     raise ValueError(f"there is no setting {name}; nearest traced settings: {nearest}.")
 
 
-def nearest_settings(name: str, known: Mapping[str, Any]) -> str:
+def nearest_fields(name: str, known: Mapping[str, Any]) -> str:
     """The known names that look most like one, as a list in words.
 
     Args:
@@ -364,7 +365,7 @@ def nearest_settings(name: str, known: Mapping[str, Any]) -> str:
     Returns:
       Up to `NUM_NEAREST` names, best first.
 
-    >>> nearest_settings("vehicles.ring_wieght", traced_settings(DetectorConfig())).split(",")[0]
+    >>> nearest_fields("vehicles.ring_wieght", traced_fields(DetectorConfig())).split(",")[0]
     'vehicles.ring_weight'
     """
     return ", ".join(difflib.get_close_matches(name, known, n=NUM_NEAREST, cutoff=0.0))

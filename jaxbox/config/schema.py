@@ -1,4 +1,4 @@
-"""The detector's settings: one sub-config a stage, and the presets.
+"""The detector's configuration: one sub-config a stage.
 
 A field marked static decides a shape or a loop bound: changing it compiles anew. Every other field
 is compared with data and is traced: a sweep over thresholds is a `jax.vmap` and compiles once.
@@ -6,25 +6,17 @@ Lengths are metres, angles degrees (``_deg``), everything else unitless unless s
 """
 
 import dataclasses
-import math
-from collections.abc import Sequence
 from typing import Any, Literal, TypeVar, dataclass_transform
 
 import jax
 
-from jaxbox.config.class_priors import CAR, TRUCK, VAN, ClassPrior, Scalar
-from jaxbox.config.sensors import sensor_settings
+from jaxbox.config.class_priors import ClassPrior, Label, Scalar
 
 _T = TypeVar("_T")
 
-
-DEFAULT_CUT = 0.15
+DEFAULT_SCORE_THRESHOLD = 0.15
 """Score from which a box is worth acting on: over sweeps whose labels go all round (Argoverse 2, PandaSet,
 SemanticKITTI) more than 9 of 10 such boxes are vehicles, see ``benchmarks/results/sensors.json``."""
-
-
-CAPACITY_STEP = 1024
-"""Proposed capacities are multiples of this, so that proposals from similar sweeps share one compile."""
 
 GROUND_CANDIDATE_CELL_M = 1.0
 """Edge of the cells whose lowest points are candidates for the ground: wide enough that most of them near by
@@ -36,11 +28,12 @@ def _static(default: Any) -> Any:
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(_static,))
-def _config(cls: type[_T]) -> type[_T]:
+def config_class(cls: type[_T]) -> type[_T]:
+    """Makes a frozen, keyword-only pytree dataclass; static fields are part of its structure."""
     return jax.tree_util.register_dataclass(dataclasses.dataclass(frozen=True, kw_only=True)(cls))
 
 
-@_config
+@config_class
 class RegionConfig:
     """The part of the world that is looked at; points outside are counted and left out.
 
@@ -53,7 +46,7 @@ class RegionConfig:
     """static: |y| below this."""
 
 
-@_config
+@config_class
 class FilterConfig:
     """Statistical filtering by mean shift and standard deviation (paper, 3.1)."""
 
@@ -73,7 +66,7 @@ class FilterConfig:
     """Points whose window holds a smaller weight are outliers: a point alone in it weighs 1."""
 
 
-@_config
+@config_class
 class GroundConfig:
     """RANSAC ground removal (Algorithm I), and the ground grid that follows uneven roads."""
 
@@ -128,7 +121,7 @@ class GroundConfig:
     """A point higher above the ground than this is overhead, and left out."""
 
 
-@_config
+@config_class
 class ComponentMap:
     """One occupancy grid whose connected components propose clusters."""
 
@@ -147,7 +140,7 @@ class ComponentMap:
     """Only points lower above the ground than this."""
 
 
-@_config
+@config_class
 class ClusteringConfig:
     """Euclidean clustering on grids (paper, 3.2, Algorithm II).
 
@@ -173,7 +166,7 @@ class ClusteringConfig:
     """Clusters longer than this along x or y are left out."""
 
 
-@_config
+@config_class
 class EvidenceConfig:
     """What each beam says about a box: hit, seen through (free) or hidden, on a polar grid."""
 
@@ -201,7 +194,7 @@ class EvidenceConfig:
     """Points within this of the ground support the ground round a box."""
 
 
-@_config
+@config_class
 class HullConfig:
     """Convex hull (paper, 3.3)."""
 
@@ -212,7 +205,7 @@ class HullConfig:
     at most one slice (the cluster's extent over the number of slices)."""
 
 
-@_config
+@config_class
 class BoxConfig:
     """Rectangle by trying all rotations (paper, 3.4, Algorithm III)."""
 
@@ -249,7 +242,7 @@ class BoxConfig:
     """Boxes with a larger part of their area seen to be free do not vote."""
 
 
-@_config
+@config_class
 class CompletionConfig:
     """Correction for occluded vehicles: sides out of sight are completed by the class prior."""
 
@@ -289,23 +282,23 @@ class CompletionConfig:
     """Cost of a width that does not extend away from the sensor."""
 
 
-@_config
+@config_class
 class VehicleConfig:
     """Vehicle decision: gates, score and suppression."""
 
     neighbourhood: bool = _static(default=True)
     """static: judge a box, and measure its height, by all points in and round it; False keeps the height of
     the cluster, and lets nothing round the box count (the paper)."""
-    classes: tuple[ClassPrior, ClassPrior, ClassPrior] = (CAR, VAN, TRUCK)
-    """Priors of car, van and truck."""
+    classes: tuple[ClassPrior, ...] = tuple(label.prior for label in Label)
+    """Priors of the classes, in the order of `Label`."""
     large_height_m: Scalar = 1.7
-    """Clusters higher than this are also tried as a van or a truck."""
+    """Clusters higher than this are also tried as a van, a truck and so on."""
     large_min_points: Scalar = 20.0
     """Clusters with fewer points are not: there would be too little to tell a van from a bush."""
     large_clearance_m: Scalar = 0.8
     """Clusters that begin higher than this above the ground are not: they are trees, say."""
     max_large: int = _static(default=768)
-    """static: capacity for clusters also tried as a van or a truck."""
+    """static: capacity for clusters also tried as a van, a truck and so on."""
     max_candidates: int = _static(default=1024)
     """static: capacity for boxes that pass the gates, before suppression."""
     max_detections: int = _static(default=128)
@@ -345,99 +338,6 @@ class VehicleConfig:
     objective_softness: Scalar = 0.1
     """See ``objective_gate``."""
     min_score: Scalar = 1e-4
-    """Boxes that score less are left out. Where you act, cut at `DEFAULT_CUT`."""
+    """Boxes that score less are left out. Where you act, cut at `DEFAULT_SCORE_THRESHOLD`."""
     max_overlap: Scalar = 0.1
     """Of two boxes with a larger bird's-eye view IoU, the lower-scoring is suppressed."""
-
-
-@_config
-class DetectorConfig:
-    """All settings of `jaxbox.detect`.
-
-    >>> DetectorConfig.paper().box.criterion
-    'area'
-    """
-
-    region: RegionConfig = RegionConfig()
-    filtering: FilterConfig = FilterConfig()
-    ground: GroundConfig = GroundConfig()
-    clustering: ClusteringConfig = ClusteringConfig()
-    evidence: EvidenceConfig = EvidenceConfig()
-    hull: HullConfig = HullConfig()
-    box: BoxConfig = BoxConfig()
-    completion: CompletionConfig = CompletionConfig()
-    vehicles: VehicleConfig = VehicleConfig()
-
-    @classmethod
-    def paper(cls) -> "DetectorConfig":
-        """The paper's own choices: one plane, fixed tolerance, smallest area, no completion."""
-        return cls(
-            ground=GroundConfig(candidates="points", surface=False, tolerance_m=0.2),
-            clustering=ClusteringConfig(
-                maps=(ComponentMap(cell_m=0.35, num_levels=13, max_cells=14336, max_height_m=4.5),),
-                adaptive_growth=0.0,
-            ),
-            evidence=EvidenceConfig(enabled=False),
-            box=BoxConfig(criterion="area", fit_to="hull", scene_direction=False),
-            completion=CompletionConfig(mode="none"),
-            vehicles=VehicleConfig(neighbourhood=False),
-        )
-
-    @classmethod
-    def fast(cls) -> "DetectorConfig":
-        """Two maps instead of three, and one reading of each cluster: less time, a little less accuracy."""
-        base = cls()
-        fine = ComponentMap(cell_m=0.13, max_cells=9216)
-        return dataclasses.replace(
-            base,
-            clustering=dataclasses.replace(base.clustering, maps=(fine, base.clustering.maps[2])),
-            completion=dataclasses.replace(base.completion, along_scene=False),
-        )
-
-    @classmethod
-    def presets(cls, *, num_beams: int = 64) -> dict[str, "DetectorConfig"]:
-        """The named presets that the command line offers, for a sensor of so many beams."""
-        presets = {"default": cls(), "fast": cls.fast(), "paper": cls.paper()}
-        return {name: cls.for_sensor(num_beams, base=preset) for name, preset in presets.items()}
-
-    @classmethod
-    def for_sensor(cls, num_beams: int, *, base: "DetectorConfig | None" = None) -> "DetectorConfig":
-        """A preset for a sensor of fewer or more beams than the 64 that it was chosen on.
-
-        Which settings depend on the beams, and how their values were measured, is in
-        `jaxbox.config.sensors`. They replace those of the base; all others, and with 64 beams all, stay.
-
-        Args:
-          num_beams: 16, 32, 64 or 128; `jaxbox info FILE` says which of them sees like another sensor.
-          base: where all else comes from; None for the default preset.
-
-        Returns:
-          The settings. The maps' max_cells are static and differ, so each sensor is a compile.
-
-        Raises:
-          ValueError: for another number of beams.
-
-        >>> DetectorConfig.for_sensor(64) == DetectorConfig()
-        True
-        """
-        base = cls() if base is None else base
-        sensor = sensor_settings(num_beams)
-        stages = {
-            stage: dataclasses.replace(getattr(base, stage), **values)
-            for stage, values in sensor.changes.items()
-        }
-        config = dataclasses.replace(base, **stages)
-        cells = [rounded_up(sensor.cells * m.max_cells) for m in config.clustering.maps]
-        return config if sensor.cells == 1 else with_max_cells(config, cells)
-
-
-def rounded_up(size: float) -> int:
-    """The least multiple of `CAPACITY_STEP` that is no smaller."""
-    return CAPACITY_STEP * math.ceil(size / CAPACITY_STEP)
-
-
-def with_max_cells(config: DetectorConfig, cells: Sequence[int]) -> DetectorConfig:
-    """The maps with other capacities for their occupied cells."""
-    maps = zip(config.clustering.maps, cells, strict=True)
-    maps = tuple(dataclasses.replace(m, max_cells=size) for m, size in maps)
-    return dataclasses.replace(config, clustering=dataclasses.replace(config.clustering, maps=maps))

@@ -17,7 +17,7 @@ TUNED_SPACING_DEG = 0.37
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class SensorSettings:
+class SensorChanges:
     """What to change in a preset for a sensor."""
 
     changes: Mapping[str, Mapping[str, float]]
@@ -26,8 +26,8 @@ class SensorSettings:
     """Occupied cells beside those of 64 beams: the capacity of each map is multiplied by it."""
 
 
-SENSORS: Mapping[int, SensorSettings] = {
-    16: SensorSettings(
+SENSORS: Mapping[int, SensorChanges] = {
+    16: SensorChanges(
         changes={
             # From ring to ring the ground is not seen, so it is smoothed farther and rises less steeply.
             "ground": {"smoothing_m": 2.0, "max_grade": 0.05},
@@ -37,7 +37,7 @@ SENSORS: Mapping[int, SensorSettings] = {
         },
         cells=0.5,
     ),
-    32: SensorSettings(
+    32: SensorChanges(
         changes={
             "ground": {"smoothing_m": 3.0},
             "clustering": {"adaptive_growth": 0.02},
@@ -46,14 +46,14 @@ SENSORS: Mapping[int, SensorSettings] = {
         },
         cells=0.75,
     ),
-    64: SensorSettings(changes={}),
-    128: SensorSettings(changes={}, cells=1.5),
+    64: SensorChanges(changes={}),
+    128: SensorChanges(changes={}, cells=1.5),
 }
 """By the number of beams, over a field of view like that of the HDL-64E; see `fitting_sensor` for others."""
 
 
-def sensor_settings(num_beams: int) -> SensorSettings:
-    """The settings of a sensor.
+def sensor_changes(num_beams: int) -> SensorChanges:
+    """What a sensor changes in a preset.
 
     Args:
       num_beams: one of `SENSORS`.

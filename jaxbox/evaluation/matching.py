@@ -16,8 +16,12 @@ import numpy as np
 from jaxbox.evaluation import kitti
 from jaxbox.evaluation.iou import framewise_overlaps, image_fractions
 from jaxbox.io import KittiObject
+from jaxbox.types import Label
 
-NEIGHBOURS: Mapping[str, tuple[str, ...]] = {"car": ("van", "truck"), "pedestrian": ("person_sitting",)}
+NEIGHBOURS: Mapping[str, tuple[str, ...]] = {
+    "car": tuple(label.word for label in Label if label is not Label.CAR),
+    "pedestrian": ("person_sitting",),
+}
 """Classes too alike to call a detection of the first one wrong; KITTI itself leaves out Truck."""
 
 RATE_OVERLAPS = (0.5, 0.7)

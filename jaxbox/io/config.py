@@ -8,7 +8,7 @@ from typing import Any
 
 from jaxbox._files import InputError, atomic_writer, read_text, reason
 from jaxbox.config import DetectorConfig
-from jaxbox.config.fields import PRESET_KEY, apply_settings, base_of, settings_to_toml, without_base
+from jaxbox.config.fields import PRESET_KEY, apply_tables, base_of, config_to_toml, without_base
 
 _MAX_BYTES = 2**20
 
@@ -32,7 +32,7 @@ def read_config(
     """
     tables = _parse(path)
     try:
-        return apply_settings(base_of(tables, preset=base, sensor=sensor), without_base(tables))
+        return apply_tables(base_of(tables, preset=base, sensor=sensor), without_base(tables))
     except ValueError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -61,7 +61,7 @@ def write_config(path: str | os.PathLike[str], config: DetectorConfig) -> None:
     """
     with atomic_writer(path) as handle:
         handle.write("# Settings of jaxbox; read by `jaxbox detect --config` and jaxbox.io.read_config.\n\n")
-        handle.write(settings_to_toml(config))
+        handle.write(config_to_toml(config))
 
 
 def _parse(path: str | os.PathLike[str]) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 Reference: the schemas ``foxglove.SceneUpdate`` and ``foxglove.PointCloud``, docs.foxglove.dev.
 """
 
+import colorsys
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -12,14 +13,22 @@ import numpy as np
 from jaxbox._files import InputError, reason
 from jaxbox.io._extras import require
 from jaxbox.io.points import Points, check_num_points, named_points, record_dtype
+from jaxbox.types import Label
+
+GOLDEN_TURN = 0.61803398875
+"""Hues that advance by this share of the circle never come close."""
 
 POINT_CLOUD = "foxglove.PointCloud"
 """Name of the schema of points."""
 
+_CHOSEN_COLORS = {
+    Label.CAR: (1.0, 0.85, 0.1),
+    Label.VAN: (1.0, 0.5, 0.1),
+    Label.TRUCK: (1.0, 0.25, 0.35),
+}
 COLORS: Mapping[str, tuple[float, float, float]] = {
-    "car": (1.0, 0.85, 0.1),
-    "van": (1.0, 0.5, 0.1),
-    "truck": (1.0, 0.25, 0.35),
+    label.word: _CHOSEN_COLORS.get(label, colorsys.hsv_to_rgb(label * GOLDEN_TURN % 1, 0.8, 1))
+    for label in Label
 }
 """Red, green, blue of each class, 0 to 1."""
 

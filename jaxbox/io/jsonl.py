@@ -27,9 +27,10 @@ def detections_record(
       timestamp_ns: when the sweep was taken, ns since 1970; None where it is unknown.
 
     Returns:
-      ``name``; ``timestamp_ns``, or None; ``boxes``, best first, each with ``label`` ("car", "van",
-      "truck"), ``score``, ``center`` (3, m), ``size`` (3, m: length, width, height), ``yaw`` (rad) and
-      ``num_points``; ``status``, one sentence a bit, empty for a clean run; ``counts``, as `Counts`.
+      ``name``; ``timestamp_ns``, or None; ``boxes``, best first, each with ``label`` (a
+      `Label.word`, such as "car"), ``score``, ``center`` (3, m), ``size`` (3, m: length, width, height),
+      ``yaw`` (rad) and ``num_points``; ``status``, one sentence a bit, empty for a clean run; ``counts``, as
+      `Counts`.
     """
     keep = np.asarray(detections.valid) & (np.asarray(detections.score) >= min_score)
     return {
@@ -43,7 +44,7 @@ def detections_record(
 
 def _box(detections: Detections, row: int) -> dict[str, Any]:
     return {
-        "label": Label(int(detections.label[row])).name.lower(),
+        "label": Label(int(detections.label[row])).word,
         "score": float(detections.score[row]),
         "center": np.asarray(detections.center[row]).tolist(),
         "size": np.asarray(detections.size[row]).tolist(),

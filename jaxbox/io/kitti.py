@@ -30,7 +30,7 @@ _OBJECT_COLUMNS = (15, 16)
 _TRACKING_COLUMNS = (17, 18)
 
 DONT_CARE = "DontCare"
-VEHICLE_TYPES = tuple(label.name.capitalize() for label in Label)
+VEHICLE_TYPES = tuple(label.word.capitalize() for label in Label)
 """Types of the objects that the detector looks for."""
 
 MIN_VISIBLE_FRACTION = 0.3
@@ -238,7 +238,7 @@ def objects_from_detections(
         np.asarray(detections.size),
         np.asarray(detections.yaw),
         calibration,
-        types=[Label(label).name.title() for label in np.asarray(detections.label).tolist()],
+        types=[Label(label).word.capitalize() for label in np.asarray(detections.label).tolist()],
         min_visible_fraction=min_visible_fraction,
     )
     return [

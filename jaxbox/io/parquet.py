@@ -1,9 +1,9 @@
 """Detections as Apache Parquet, one row a box, for tables and clusters: pandas, DuckDB, Spark.
 
-Columns: ``sweep`` (its name), ``timestamp_ns`` (int64, ns since 1970, or null), ``label`` ("car", "van",
-"truck"), ``score``, ``center_x``, ``center_y``, ``center_z``, ``length``, ``width``, ``height`` (m, sensor
-frame), ``yaw`` (rad), all float32, and ``num_points`` (int32). A sweep without boxes has no row; the names of
-all sweeps are a JSON list in the file's metadata under ``jaxbox.sweeps``.
+Columns: ``sweep`` (its name), ``timestamp_ns`` (int64, ns since 1970, or null), ``label`` (a
+`Label.word`, such as "car"), ``score``, ``center_x``, ``center_y``, ``center_z``, ``length``, ``width``,
+``height`` (m, sensor frame), ``yaw`` (rad), all float32, and ``num_points`` (int32). A sweep without boxes
+has no row; the names of all sweeps are a JSON list in the file's metadata under ``jaxbox.sweeps``.
 """
 
 import contextlib

@@ -99,27 +99,27 @@ def detect(xyz: np.ndarray, config: DetectorConfig | None = None, seed: int = 0)
     0
     """
     # Thresholds may be arrays for the compiled detector; here they are numbers, and need no type.
-    settings: Any = config or DetectorConfig()
+    config = config or DetectorConfig()
     xyz = np.asarray(xyz, np.float64)
-    finite, valid = select_points(xyz, half_x_m=settings.region.half_x_m, half_y_m=settings.region.half_y_m)
-    inlier = _filter(xyz, valid, settings)
-    ground = _fit_ground(xyz, inlier, settings, np.random.default_rng(seed))
+    finite, valid = select_points(xyz, half_x_m=config.region.half_x_m, half_y_m=config.region.half_y_m)
+    inlier = _filter(xyz, valid, config)
+    ground = _fit_ground(xyz, inlier, config, np.random.default_rng(seed))
     height = np.full(len(xyz), np.nan)
-    height[inlier] = _height(xyz[inlier], ground, settings)
+    height[inlier] = _height(xyz[inlier], ground, config)
     # NaN, the height of points that are left out, is on no side.
-    is_ground = height <= settings.ground.min_height_m
-    is_overhead = height >= settings.ground.max_height_m
+    is_ground = height <= config.ground.min_height_m
+    is_overhead = height >= config.ground.max_height_m
     obstacle_rows = np.flatnonzero(inlier & ~is_ground & ~is_overhead)
-    obstacles = index_obstacles(xyz, height, obstacle_rows[: settings.clustering.max_obstacles])
+    obstacles = index_obstacles(xyz, height, obstacle_rows[: config.clustering.max_obstacles])
 
-    maps = [find_clusters(obstacles, component_map, settings) for component_map in settings.clustering.maps]
-    proposals = [make_proposals(obstacles, slot, settings) for _, slot, _ in maps]
-    evidence = _evidence(xyz[inlier], height[inlier], ground, settings)
-    candidates, num_assignments = judge_candidates(proposals, obstacles, evidence, settings)
-    best = candidates[: settings.vehicles.max_candidates]
+    maps = [find_clusters(obstacles, component_map, config) for component_map in config.clustering.maps]
+    proposals = [make_proposals(obstacles, slot, config) for _, slot, _ in maps]
+    evidence = _evidence(xyz[inlier], height[inlier], ground, config)
+    candidates, num_assignments = judge_candidates(proposals, obstacles, evidence, config)
+    best = candidates[: config.vehicles.max_candidates]
     boxes = np.array([candidate.completed.box for candidate in best]).reshape(-1, 5)
     scores = np.array([candidate.score for candidate in best])
-    rows = suppress(boxes, scores, max_overlap=settings.vehicles.max_overlap)
+    rows = suppress(boxes, scores, max_overlap=float(config.vehicles.max_overlap))
 
     counts = {
         "dropped_points": 0,
@@ -129,8 +129,8 @@ def detect(xyz: np.ndarray, config: DetectorConfig | None = None, seed: int = 0)
         "ground_points": int(is_ground.sum()),
         "overhead_points": int(is_overhead.sum()),
         "dropped_obstacles": len(obstacle_rows) - len(obstacles.rows),
-        **_cluster_counts(obstacles, maps, settings),
-        "large_clusters": sum(is_large(p, settings) for of_map in proposals for p in of_map),
+        **_cluster_counts(obstacles, maps, config),
+        "large_clusters": sum(is_large(p, config) for of_map in proposals for p in of_map),
         "obstacles": len(obstacle_rows),
         "assignments": num_assignments,
         "candidates": len(candidates),
@@ -138,24 +138,24 @@ def detect(xyz: np.ndarray, config: DetectorConfig | None = None, seed: int = 0)
     }
     component = np.full(len(xyz), NO_CLUSTER)
     component[obstacles.rows] = maps[0][0]
-    winners = [best[row] for row in rows[: settings.vehicles.max_detections]]
+    winners = [best[row] for row in rows[: config.vehicles.max_detections]]
     points = {"height": height, "ground_mask": is_ground, "point_component": component}
-    return _assemble(winners, obstacles, ground, counts, settings=settings, points=points)
+    return _assemble(winners, obstacles, ground, counts, config=config, points=points)
 
 
-def _filter(xyz: np.ndarray, valid: np.ndarray, settings: Any) -> np.ndarray:
+def _filter(xyz: np.ndarray, valid: np.ndarray, config: Any) -> np.ndarray:
     inlier = valid.copy()
-    if settings.filtering.enabled:
+    if config.filtering.enabled:
         names = ("cell_m", "num_levels", "num_iterations", "bandwidth_m", "num_std", "min_density")
-        options = select_options(settings.filtering, *names) | select_options(
-            settings.region, "half_x_m", "half_y_m"
+        options = select_options(config.filtering, *names) | select_options(
+            config.region, "half_x_m", "half_y_m"
         )
         inlier[valid] = filter_outliers(xyz[valid], **options)
     return inlier
 
 
-def _fit_ground(xyz: np.ndarray, inlier: np.ndarray, settings: Any, rng: np.random.Generator) -> _Ground:
-    ground = settings.ground
+def _fit_ground(xyz: np.ndarray, inlier: np.ndarray, config: Any, rng: np.random.Generator) -> _Ground:
+    ground = config.ground
     if ground.candidates == "cell_minima":
         half = {"half_x_m": ground.candidate_half_x_m, "half_y_m": ground.candidate_half_y_m}
         candidates = cell_minima(xyz[inlier], **half)
@@ -176,23 +176,23 @@ def _fit_ground(xyz: np.ndarray, inlier: np.ndarray, settings: Any, rng: np.rand
         names = ("num_envelope_rounds", "max_grade", "band_below_m", "band_below_grade", "band_above_m")
         names += ("band_above_grade", "blind_radius_m", "envelope_margin_m", "smoothing_m", "min_height_m")
         grid = fit_ground_surface(
-            xyz[inlier], planes, **select_options(ground, *names), **_surface_grid(settings)
+            xyz[inlier], planes, **select_options(ground, *names), **_surface_grid(config)
         )
     return _Ground(planes, fits[0][1], fits[0][2], grid)
 
 
-def _surface_grid(settings: Any) -> dict[str, Any]:
-    return {"cell_m": settings.ground.surface_cell_m, "half_m": settings.ground.surface_half_m}
+def _surface_grid(config: Any) -> dict[str, Any]:
+    return {"cell_m": config.ground.surface_cell_m, "half_m": config.ground.surface_half_m}
 
 
-def _height(xyz: np.ndarray, ground: _Ground, settings: Any) -> np.ndarray:
-    options = _surface_grid(settings) | select_options(settings.ground, "min_height_m")
+def _height(xyz: np.ndarray, ground: _Ground, config: Any) -> np.ndarray:
+    options = _surface_grid(config) | select_options(config.ground, "min_height_m")
     return height_above_ground(xyz, ground.planes, ground.grid, **options)
 
 
-def _cluster_counts(obstacles: Obstacles, maps: list[Any], settings: Any) -> dict[str, Any]:
+def _cluster_counts(obstacles: Obstacles, maps: list[Any], config: Any) -> dict[str, Any]:
     clustered = int(np.any([slot != NO_CLUSTER for _, slot, _ in maps], axis=0).sum())
-    box, height = settings.box, obstacles.height
+    box, height = config.box, obstacles.height
     return {
         "clustered_points": clustered,
         "unclustered_points": len(height) - clustered,
@@ -202,30 +202,30 @@ def _cluster_counts(obstacles: Obstacles, maps: list[Any], settings: Any) -> dic
     }
 
 
-def _evidence(xyz: np.ndarray, height: np.ndarray, ground: _Ground, settings: Any) -> Evidence | None:
-    if not settings.evidence.enabled:
+def _evidence(xyz: np.ndarray, height: np.ndarray, ground: _Ground, config: Any) -> Evidence | None:
+    if not config.evidence.enabled:
         return None
-    fields = {field.name for field in dataclasses.fields(settings.evidence)} - {"enabled"}
+    fields = {field.name for field in dataclasses.fields(config.evidence)} - {"enabled"}
     sensor_height_m = -float(ground.planes[0, 2])
     return build_evidence(
-        xyz, height, sensor_height_m=sensor_height_m, **select_options(settings.evidence, *fields)
+        xyz, height, sensor_height_m=sensor_height_m, **select_options(config.evidence, *fields)
     )
 
 
 def _vertical(
-    candidate: Candidate, obstacles: Obstacles, ground: _Ground, settings: Any
+    candidate: Candidate, obstacles: Obstacles, ground: _Ground, config: Any
 ) -> tuple[float, float]:
     """Middle and height of a box along z."""
     # z tells which of several planes the vehicle stands on.
     z = obstacles.xyz[candidate.proposal.members, 2].min()
-    options = _surface_grid(settings) | select_options(settings.ground, "min_height_m")
+    options = _surface_grid(config) | select_options(config.ground, "min_height_m")
     place = np.append(candidate.completed.box[:2], z)[None]
     ground_z = ground_elevation(place, ground.planes, ground.grid, **options)[0]
-    if not settings.vehicles.surroundings:
+    if not config.vehicles.surroundings:
         bottom, top = candidate.proposal.bottom_m, candidate.proposal.top_m
         return ground_z + (bottom + top) / 2, top - bottom
-    prior = settings.vehicles.classes[candidate.label]
-    height = max(candidate.around.top_m + settings.vehicles.top_margin_m, prior.min_box_height_m)
+    prior = config.vehicles.classes[candidate.label]
+    height = max(candidate.around.top_m + config.vehicles.top_margin_m, prior.min_box_height_m)
     return ground_z + height / 2, height
 
 
@@ -235,13 +235,13 @@ def _assemble(
     ground: _Ground,
     counts: dict[str, Any],
     *,
-    settings: Any,
+    config: Any,
     points: dict[str, np.ndarray],
 ) -> ReferenceDetections:
     own, point_detection = _own_points(winners, obstacles, len(points["height"]))
     hulls = tuple(convex_hull(xy) for xy in own)
     boxes = np.array([w.completed.box for w in winners]).reshape(-1, 5)
-    vertical = np.array([_vertical(w, obstacles, ground, settings) for w in winners]).reshape(-1, 2)
+    vertical = np.array([_vertical(w, obstacles, ground, config) for w in winners]).reshape(-1, 2)
     return ReferenceDetections(
         center=np.column_stack([boxes[:, :2], vertical[:, 0]]),
         size=np.column_stack([boxes[:, 2:4], vertical[:, 1]]),

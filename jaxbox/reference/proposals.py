@@ -108,46 +108,46 @@ def index_obstacles(xyz: np.ndarray, height: np.ndarray, rows: np.ndarray) -> Ob
 
 
 def find_clusters(
-    obstacles: Obstacles, component_map: ComponentMap, settings: Any
+    obstacles: Obstacles, component_map: ComponentMap, config: Any
 ) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
     """Finds the clusters of one component map.
 
     Args:
       obstacles: of the sweep, m of them.
       component_map: the map.
-      settings: of the detector.
+      config: of the detector.
 
     Returns:
       Component (m,) and cluster (m,) of each obstacle, `NO_CLUSTER` where it has none, and the
       numbers of runs of occupied cells and of clusters.
     """
     fields: Any = component_map
-    clustering = settings.clustering
+    clustering = config.clustering
     member = (obstacles.height > fields.min_height_m) & (obstacles.height < fields.max_height_m)
     xy = obstacles.xyz[member, :2]
     cells, shape = grid_cells(
         warp_range(xy, start_m=clustering.adaptive_start_m, growth=clustering.adaptive_growth),
         obstacles.height[member],
-        **select_options(settings.region, "half_x_m", "half_y_m"),
+        **select_options(config.region, "half_x_m", "half_y_m"),
         **select_options(fields, "cell_m", "num_levels", "min_height_m"),
     )
     component = np.full(len(member), NO_CLUSTER)
     slot = np.full(len(member), NO_CLUSTER)
     component[member] = label_components(cells, shape)
     gates = select_options(clustering, "min_points", "max_extent_m")
-    gates |= select_options(settings.vehicles, "min_extent_m")
+    gates |= select_options(config.vehicles, "min_extent_m")
     slot[member], num_clusters = keep_clusters(xy, component[member], **gates)
     slot[slot >= fields.max_clusters] = NO_CLUSTER
     return component, slot, (count_runs(cells, shape), num_clusters)
 
 
-def make_proposals(obstacles: Obstacles, slot: np.ndarray, settings: Any) -> list[Proposal]:
+def make_proposals(obstacles: Obstacles, slot: np.ndarray, config: Any) -> list[Proposal]:
     """Fits rectangles to the clusters of one map.
 
     Args:
       obstacles: of the sweep, m of them.
       slot: (m,) int, cluster of each, from `find_clusters`.
-      settings: of the detector.
+      config: of the detector.
 
     Returns:
       One proposal a cluster, in the order of the clusters.
@@ -157,18 +157,18 @@ def make_proposals(obstacles: Obstacles, slot: np.ndarray, settings: Any) -> lis
     starts = np.flatnonzero(np.diff(slot[order])) + 1
     proposals = []
     for members in np.split(order, starts) if len(order) else []:
-        xy = _outline(members, obstacles, settings)
+        xy = _outline(members, obstacles, config)
         curve, extents = criterion_curve(
-            xy, **select_options(settings.box, "criterion", "num_angles", "min_distance_m")
+            xy, **select_options(config.box, "criterion", "num_angles", "min_distance_m")
         )
         height = obstacles.height[members]
         proposals.append(Proposal(members, xy, curve, extents, float(height.min()), float(height.max())))
     return proposals
 
 
-def _outline(members: np.ndarray, obstacles: Obstacles, settings: Any) -> np.ndarray:
+def _outline(members: np.ndarray, obstacles: Obstacles, config: Any) -> np.ndarray:
     """(j, 2) m: the points of a cluster that its rectangle is fitted to."""
-    box = settings.box
+    box = config.box
     if box.fit_to == "hull":
         return convex_hull(obstacles.xyz[members, :2])
     chosen = fit_points(
@@ -181,17 +181,17 @@ def _outline(members: np.ndarray, obstacles: Obstacles, settings: Any) -> np.nda
     return obstacles.xyz[chosen, :2]
 
 
-def is_large(proposal: Proposal, settings: Any) -> bool:
-    """Whether a cluster is tried as a van and a truck too: high, and standing on the ground.
+def is_large(proposal: Proposal, config: Any) -> bool:
+    """Whether a cluster is tried as the larger classes too: high, and standing on the ground.
 
     Args:
       proposal: the cluster.
-      settings: of the detector.
+      config: of the detector.
 
     Returns:
       True for those.
     """
-    vehicles = settings.vehicles
+    vehicles = config.vehicles
     stands = proposal.bottom_m < vehicles.large_clearance_m
     enough = len(proposal.members) >= vehicles.large_min_points
     return stands and enough and proposal.top_m > vehicles.large_height_m
@@ -209,7 +209,7 @@ def _complete(
     readings: list[Reading],
     prior: ClassPrior,
     evidence: Evidence | None,
-    settings: Any,
+    config: Any,
 ) -> CompletedBox | None:
     names = ("mode", "num_rays", "free_weight", "free_length_weight", "inside_weight", "near_weight")
     names += ("closeness_weight", "not_away_cost", "seen_length", "seen_width", "seen_weight")
@@ -219,18 +219,18 @@ def _complete(
         readings,
         evidence=evidence,
         **select_options(prior, "length_m", "width_m", "max_length_m", "max_width_m"),
-        **select_options(settings.completion, *names),
+        **select_options(config.completion, *names),
     )
 
 
-def _preference(proposals: list[Proposal], evidence: Evidence | None, settings: Any) -> np.ndarray:
+def _preference(proposals: list[Proposal], evidence: Evidence | None, config: Any) -> np.ndarray:
     """The gain of each rotation from the direction that the first map's clusters share."""
-    box, car = settings.box, settings.vehicles.classes[Label.CAR]
+    box, car = config.box, config.vehicles.classes[Label.CAR]
     none = np.zeros(box.num_angles)
     if not box.scene_direction:
         return none
     names = ("seen_length", "seen_width", "seen_weight", "length_margin_m", "width_margin_m")
-    options = select_options(settings.completion, *names)
+    options = select_options(config.completion, *names)
     options |= select_options(car, "length_m", "width_m", "max_length_m", "max_width_m")
     fits = [(p, boxes_away(_reading(p, none), **options)) for p in proposals]
     fits = [(p, boxes) for p, boxes in fits if boxes]
@@ -239,7 +239,7 @@ def _preference(proposals: list[Proposal], evidence: Evidence | None, settings: 
 
     def free_length(boxes: list[CompletedBox]) -> float:
         places = np.array([fit.box for fit in boxes])
-        rays = box_evidence(places, evidence, num_rays=settings.completion.num_final_rays)
+        rays = box_evidence(places, evidence, num_rays=config.completion.num_final_rays)
         return rays.free_length.min()
 
     # Modulo a quarter turn either way to lie votes for the same.
@@ -259,50 +259,49 @@ def _preference(proposals: list[Proposal], evidence: Evidence | None, settings: 
 
 
 def judge_candidates(
-    proposals: list[list[Proposal]], obstacles: Obstacles, evidence: Evidence | None, settings: Any
+    proposals: list[list[Proposal]], obstacles: Obstacles, evidence: Evidence | None, config: Any
 ) -> tuple[list[Candidate], int]:
-    """Scores every proposal as a car, and the high ones as a van and as a truck too.
+    """Scores every proposal as a car, and the high ones as each other class too.
 
     Args:
       proposals: of each map; the first also gives the scene's direction.
       obstacles: of the sweep.
       evidence: of the sweep, or None.
-      settings: of the detector.
+      config: of the detector.
 
     Returns:
       What scores more than the least score, best first; how many assignments the evidence had to weigh.
     """
-    vehicles = settings.vehicles
-    preference = _preference(proposals[0], evidence, settings)
-    along_scene = settings.box.scene_direction and settings.completion.along_scene
+    vehicles = config.vehicles
+    preference = _preference(proposals[0], evidence, config)
+    along_scene = config.box.scene_direction and config.completion.along_scene
     every = [proposal for of_map in proposals for proposal in of_map]
-    large = [p for p in every if is_large(p, settings)][: vehicles.max_large]
+    large = [p for p in every if is_large(p, config)][: vehicles.max_large]
     candidates, num_assignments = [], 0
-    for label, chosen in ((Label.CAR, every), (Label.VAN, large), (Label.TRUCK, large)):
-        prior = vehicles.classes[label]
-        for proposal in chosen:
+    for label, prior in zip(Label, vehicles.classes, strict=True):
+        for proposal in every if label is Label.CAR else large:
             readings = [_reading(proposal, preference)]
-            if not _is_tall(proposal, readings[0], settings):
+            if not _is_tall(proposal, readings[0], config):
                 continue
             if along_scene:
                 readings.append(_reading(proposal, preference, INSISTENCE))
-            if settings.completion.mode == "evidence":
+            if config.completion.mode == "evidence":
                 num_assignments += count_assignments(readings, prior.max_length_m, prior.max_width_m)
-            completed = _complete(proposal, readings, prior, evidence, settings)
+            completed = _complete(proposal, readings, prior, evidence, config)
             if completed is not None:
                 judged = _judge(
-                    proposal, completed, label, obstacles=obstacles, evidence=evidence, settings=settings
+                    proposal, completed, label, obstacles=obstacles, evidence=evidence, config=config
                 )
                 candidates.append(judged)
     candidates = [c for c in candidates if c.score > vehicles.min_score]
     return sorted(candidates, key=lambda c: -c.score), num_assignments
 
 
-def _is_tall(proposal: Proposal, reading: Reading, settings: Any) -> bool:
+def _is_tall(proposal: Proposal, reading: Reading, config: Any) -> bool:
     """Whether a cluster can be (the lower part of) a vehicle of the lowest class."""
     u0, u1, v0, v1 = reading.extents
-    allowance = settings.vehicles.top_grade * np.hypot((u0 + u1) / 2, (v0 + v1) / 2)
-    lowest = min(prior.min_height_m for prior in settings.vehicles.classes)
+    allowance = config.vehicles.top_grade * np.hypot((u0 + u1) / 2, (v0 + v1) / 2)
+    lowest = min(prior.min_height_m for prior in config.vehicles.classes)
     return proposal.top_m + allowance > lowest - LOWER_PART_M
 
 
@@ -313,12 +312,12 @@ def _judge(
     *,
     obstacles: Obstacles,
     evidence: Evidence | None,
-    settings: Any,
+    config: Any,
 ) -> Candidate:
-    vehicles, box = settings.vehicles, completed.box
+    vehicles, box = config.vehicles, completed.box
     prior = vehicles.classes[label]
-    around = _look_around(proposal, box, prior, obstacles, settings)
-    rays = box_evidence(box[None], evidence, num_rays=settings.completion.num_final_rays)
+    around = _look_around(proposal, box, prior, obstacles, config)
+    rays = box_evidence(box[None], evidence, num_rays=config.completion.num_final_rays)
     names = (
         "top_grade",
         "min_extent_m",
@@ -344,9 +343,9 @@ def _judge(
 
 
 def _look_around(
-    proposal: Proposal, box: np.ndarray, prior: Any, obstacles: Obstacles, settings: Any
+    proposal: Proposal, box: np.ndarray, prior: Any, obstacles: Obstacles, config: Any
 ) -> PointsAround:
-    vehicles = settings.vehicles
+    vehicles = config.vehicles
     if not vehicles.surroundings:
         return PointsAround(inside=len(proposal.members), top_m=proposal.top_m, overhead=0, ring=0)
     assert obstacles.tree is not None
@@ -356,7 +355,7 @@ def _look_around(
         obstacles.xyz[near],
         obstacles.height[near],
         **select_options(vehicles, "margin_m", "ring_m", "upper_height_m", "stray_share"),
-        **select_options(settings.ground, "min_height_m", "max_height_m"),
+        **select_options(config.ground, "min_height_m", "max_height_m"),
         count_max_height_m=prior.count_max_height_m,
         recess_m=prior.recess_m,
     )

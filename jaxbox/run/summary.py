@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxbox.config import DEFAULT_CUT, DetectorConfig
+from jaxbox.config import DEFAULT_SCORE_THRESHOLD, DetectorConfig
+from jaxbox.config.capacities import CAPACITIES, CLOUD_CAPACITY
 from jaxbox.config.schema import GROUND_CANDIDATE_CELL_M
 from jaxbox.types import NUM_POINT_COUNTS, Counts, Detections, GroundPlane, Label, Status
 
@@ -108,7 +109,9 @@ def classes_in_words(labels: np.ndarray) -> str:
     """
     counts = collections.Counter(Label(label) for label in labels.tolist())
     return ", ".join(
-        f"{counts[label]} {label.name.lower()}{'s' * (counts[label] > 1)}" for label in Label if counts[label]
+        f"{counts[label]} {label.plural if counts[label] > 1 else label.word}"
+        for label in Label
+        if counts[label]
     )
 
 
@@ -127,7 +130,7 @@ class Summary:
     num_boxes: int
     """Boxes from `min_score` on."""
     boxes: dict[str, int]
-    """Those by class: "car", "van" and "truck"."""
+    """Those by class, each a `Label.word` such as "car"."""
     min_score: float
     """The cut."""
     score: Spread
@@ -167,7 +170,10 @@ class Summary:
 
 
 def summarise(
-    detections: Detections, config: DetectorConfig | None = None, *, min_score: float = DEFAULT_CUT
+    detections: Detections,
+    config: DetectorConfig | None = None,
+    *,
+    min_score: float = DEFAULT_SCORE_THRESHOLD,
 ) -> Summary:
     """Gathers what a system alarms on: counts a stage, how full each capacity was, boxes, the ground.
 
@@ -193,7 +199,7 @@ def summarise(
         capacities=tuple(_capacities(counts, detections.ground_mask.shape[-1], config)),
         status=Status(int(detections.status)),
         num_boxes=int(keep.sum()),
-        boxes={kind.name.lower(): int((label == kind).sum()) for kind in Label},
+        boxes={kind.word: int((label == kind).sum()) for kind in Label},
         min_score=min_score,
         score=Spread.of(score[keep]),
         range_m=Spread.of(np.hypot(center[:, 0], center[:, 1])),
@@ -206,27 +212,12 @@ def summarise(
 
 def _capacities(counts: Counts, num_rows: int, config: DetectorConfig) -> Sequence[CapacityUse]:
     """Every capacity beside what it had to hold, in the order of the stages."""
-    obstacles = config.clustering.max_obstacles or -(-3 * num_rows // 4)
-    uses = [
-        CapacityUse("PointCloud.from_numpy(capacity=...)", counts.num_points, num_rows),
-        CapacityUse("clustering.max_obstacles", int(counts.obstacles), obstacles),
-    ]
-    for i, settings in enumerate(config.clustering.maps):
-        where = f"clustering.maps.{i}"
-        uses.append(CapacityUse(f"{where}.max_cells", int(counts.cells[i]), settings.max_cells))
-        uses.append(CapacityUse(f"{where}.max_clusters", int(counts.clusters[i]), settings.max_clusters))
-    if config.box.fit_to == "slab":
-        slab = config.box.max_slab_points or -(-num_rows // 4)
-        uses.append(CapacityUse("box.max_slab_points", int(counts.slab_points), slab))
-    vehicles = config.vehicles
-    return [
-        *uses,
-        CapacityUse("vehicles.max_large", int(counts.large_clusters), vehicles.max_large),
-        CapacityUse("completion.max_assignments", int(counts.assignments), config.completion.max_assignments),
-        CapacityUse("vehicles.max_candidates", int(counts.candidates), vehicles.max_candidates),
-        CapacityUse("vehicles.max_detections", int(counts.detections), vehicles.max_detections),
-        CapacityUse("hull.max_vertices", int(counts.hull_vertices), config.hull.max_vertices),
-    ]
+    uses = [CapacityUse(CLOUD_CAPACITY, counts.num_points, num_rows)]
+    for row in CAPACITIES:
+        sizes = row.sizes(config, num_rows)
+        needed = np.atleast_1d(getattr(counts, row.count))[: len(sizes)].tolist()
+        uses += [CapacityUse(name, n, size) for (name, size), n in zip(sizes.items(), needed, strict=True)]
+    return uses
 
 
 def _num_candidates(config: DetectorConfig) -> int:

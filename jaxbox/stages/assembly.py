@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.config import DetectorConfig
-from jaxbox.config.capacities import slab_capacity
 from jaxbox.stages.state import (
     Candidates,
     Clusters,
@@ -180,24 +179,12 @@ def _counts(points: jax.Array, cloud: PointCloud, found: Found, largest_hull: ja
 
 
 def _status(cloud: PointCloud, counts: Counts, ground: Ground, config: DetectorConfig) -> jax.Array:
-    settings = config.vehicles
-    not_valid = counts.dropped_points + counts.nonfinite_points + counts.out_of_range_points
-    max_clusters = jnp.array([m.max_clusters for m in config.clustering.maps], jnp.int32)
-    max_cells = jnp.array([m.max_cells for m in config.clustering.maps], jnp.int32)
+    not_in_region = counts.dropped_points + counts.nonfinite_points + counts.out_of_range_points
     bits = {
-        Status.EMPTY: cloud.num_points == not_valid,
+        Status.EMPTY: cloud.num_points == not_in_region,
         Status.NONFINITE_POINTS: counts.nonfinite_points > 0,
         Status.POINT_OVERFLOW: counts.dropped_points > 0,
         Status.NO_GROUND: ~ground.plane.found,
-        Status.OBSTACLE_OVERFLOW: (counts.dropped_obstacles > 0)
-        | ((config.box.fit_to == "slab") & (counts.slab_points > slab_capacity(config.box, cloud.capacity))),
-        Status.CELL_OVERFLOW: jnp.any(counts.cells > max_cells),
-        Status.CLUSTER_OVERFLOW: jnp.any(counts.clusters > max_clusters)
-        | (counts.large_clusters > settings.max_large),
-        Status.ASSIGNMENT_OVERFLOW: counts.assignments > config.completion.max_assignments,
-        Status.CANDIDATE_OVERFLOW: counts.candidates > settings.max_candidates,
-        Status.DETECTION_OVERFLOW: counts.detections > settings.max_detections,
-        Status.HULL_OVERFLOW: counts.hull_vertices > config.hull.max_vertices,
         Status.GROUND_ABOVE: ground.plane.found & (ground.plane.coefficients[2] > GROUND_ABOVE_M),
-    }
+    } | counts.overflows(config, cloud.capacity)
     return sum((jnp.where(is_set, jnp.int32(bit), 0) for bit, is_set in bits.items()), jnp.int32(0))

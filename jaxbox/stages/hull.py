@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from jaxbox.config import BoxConfig, DetectorConfig, HullConfig
+from jaxbox.config import DetectorConfig, HullConfig
 from jaxbox.config.capacities import slab_capacity
 from jaxbox.stages.state import Clusters, Kept, Obstacles, Outlines, Owners
 from jaxbox.types import Hulls
@@ -32,7 +32,7 @@ def outline_clusters(obstacles: Obstacles, clusters: Clusters, config: DetectorC
     """
     if config.box.fit_to == "hull":
         return _hull_points(obstacles, clusters, config.hull)
-    return _slab_points(obstacles, clusters, config.box)
+    return _slab_points(obstacles, clusters, config)
 
 
 def _hull_points(obstacles: Obstacles, clusters: Clusters, config: HullConfig) -> Outlines:
@@ -49,14 +49,14 @@ def _hull_points(obstacles: Obstacles, clusters: Clusters, config: HullConfig) -
     return Outlines(points, jnp.max(count))
 
 
-def _slab_points(obstacles: Obstacles, clusters: Clusters, config: BoxConfig) -> Outlines:
+def _slab_points(obstacles: Obstacles, clusters: Clusters, config: DetectorConfig) -> Outlines:
     """The points of each cluster between the slab's heights, or all where those are few."""
     capacity = clusters.of_point.shape[0] * slab_capacity(config, obstacles.num_rows)
     lists = list_points(
         *_list_rows(obstacles, clusters, clusters.fitted, capacity),
         obstacles.xy,
         num_clusters=clusters.num_points.shape[0],
-        max_points=config.max_points,
+        max_points=config.box.max_points,
     )
     return Outlines(lists, jnp.int32(0))
 

@@ -23,13 +23,14 @@ CAR_SIZE_M = (
     (1.27, 1.36, 1.43, 1.50, 1.59, 1.78, 1.97),
 )
 """Length, width and height of the KITTI object benchmark's cars (Geiger et al. 2012) at these quantiles."""
-VAN_SIZE_M = (4.98, 1.88, 2.13)
-TRUCK_SIZE_M = (10.81, 2.63, 3.34)
-"""Medians of the same benchmark."""
+MEDIAN_SIZE_M = {Label.VAN: (4.98, 1.88, 2.13), Label.TRUCK: (10.81, 2.63, 3.34)}
+"""Medians of the same benchmark; another class has the size of its prior."""
 SIZE_SPREAD = {Label.VAN: (0.9, 1.15), Label.TRUCK: (0.7, 1.1)}
 """Factors on the median; their ends keep vans apart from cars and trucks."""
+OTHER_SPREAD = (0.9, 1.1)
+"""Of a class that says no other."""
 LABEL_SHARES = {Label.CAR: 0.82, Label.VAN: 0.12, Label.TRUCK: 0.06}
-"""About the benchmark's own, with a few more vans and trucks."""
+"""About the benchmark's own, with a few more vans and trucks; a class without a share stands in no street."""
 PLACES = {"right": 0.3, "left": 0.24, "oncoming": 0.17, "ahead": 0.14, "perpendicular": 0.15}
 """Where vehicles stand: parked in a row, driving, or parked across the road's direction."""
 HEADING_SD_DEG = {"right": 1.5, "left": 1.5, "oncoming": 1.0, "ahead": 1.0, "perpendicular": 6.0}
@@ -235,13 +236,14 @@ def draw_size(rng: np.random.Generator, label: Label) -> tuple[float, float, flo
     """Length, width and height, m, of a vehicle of a class.
 
     Cars follow the benchmark's own quantiles, between its 1st and 99th percentile, each dimension by
-    itself; vans and trucks are their median, scaled.
+    itself; all others are their median, scaled.
     """
     if label is Label.CAR:
         length, width, height = (float(np.interp(rng.random(), SIZE_QUANTILES, q)) for q in CAR_SIZE_M)
         return length, width, height
-    median = VAN_SIZE_M if label is Label.VAN else TRUCK_SIZE_M
-    scale = rng.uniform(*SIZE_SPREAD[label])
+    prior = label.prior
+    median = MEDIAN_SIZE_M.get(label, (prior.length_m, prior.width_m, prior.height_m))
+    scale = rng.uniform(*SIZE_SPREAD.get(label, OTHER_SPREAD))
     # Vehicles vary more in length than in width and height.
     return float(median[0] * scale), float(median[1] * scale**0.3), float(median[2] * scale**0.5)
 

@@ -219,13 +219,13 @@ def vehicle_solids(label: Label, size: Sequence[float]) -> list[Solid]:
     The pieces touch all six faces of the box (length, width, height): bumpers, tyres and roof.
 
     Args:
-      label: decides the shape.
+      label: decides the shape; all but cars and vans look like trucks.
       size: (length, width, height), m.
 
     Returns:
       Convex solids within the box.
     """
-    return {Label.CAR: _car, Label.VAN: _van, Label.TRUCK: _truck}[label](*size)
+    return {Label.CAR: _car, Label.VAN: _van}.get(label, _truck)(*size)
 
 
 SEDAN_LENGTH_M = 4.2

@@ -138,7 +138,7 @@ def report_tables(report: Mapping[str, Any]) -> list[Table]:
     Returns:
       Title, columns and rows of each table.
     """
-    tables = [_copies_table(report), _settings_table(report), _trials_table(report)]
+    tables = [_copies_table(report), _config_table(report), _trials_table(report)]
     return tables if report["held_out"] is None else [*tables, _groups_table(report)]
 
 
@@ -152,7 +152,7 @@ def _copies_table(report: Mapping[str, Any]) -> Table:
     return "objective by copy", ["", *report["copies"], "mean", "sd"], rows
 
 
-def _settings_table(report: Mapping[str, Any]) -> Table:
+def _config_table(report: Mapping[str, Any]) -> Table:
     best = report["best"]["changes"]
     rows = [
         [

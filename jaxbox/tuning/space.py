@@ -7,7 +7,7 @@ from collections.abc import Generator, Mapping, Sequence
 import numpy as np
 
 from jaxbox.config import DetectorConfig
-from jaxbox.config.fields import check_traced, traced_settings
+from jaxbox.config.fields import check_traced, traced_fields
 
 Changes = Mapping[str, float]
 """Thresholds by dotted name that differ from the base."""
@@ -104,7 +104,7 @@ def parse_axis(config: DetectorConfig, text: str) -> Axis:
 
 def default_axes(config: DetectorConfig) -> list[Axis]:
     """The default space round a base; see `DEFAULT_RATIOS`."""
-    values = traced_settings(config)
+    values = traced_fields(config)
     return [
         Axis(name, float(values[name]) / ratio, float(values[name]) * ratio, log=True)
         for name, ratio in DEFAULT_RATIOS.items()
@@ -113,7 +113,7 @@ def default_axes(config: DetectorConfig) -> list[Axis]:
 
 def axis_values(config: DetectorConfig, axes: Sequence[Axis]) -> dict[str, float]:
     """The settings' own value of each axis, by name."""
-    values = traced_settings(config)
+    values = traced_fields(config)
     return {axis.name: float(values[axis.name]) for axis in axes}
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxbox._padding import fitting_capacity
 from jaxbox.config import DetectorConfig
-from jaxbox.config.fields import replace_settings
+from jaxbox.config.fields import replace_fields
 from jaxbox.evaluation.copies import Copy, Frame, detect_copy
 from jaxbox.evaluation.objectives import Matched, Objective
 from jaxbox.run.compiled import detect
@@ -84,10 +84,10 @@ class Bench:
           The trial.
 
         Raises:
-          ValueError: for changes that `replace_settings` refuses.
+          ValueError: for changes that `replace_fields` refuses.
         """
         start = time.perf_counter()
-        config = replace_settings(self.base, changes)
+        config = replace_fields(self.base, changes)
         labels = {frame.name: frame.labels for frame in self.frames}
         matches, status = [], Status.OK
         for copy in self.copies:

@@ -5,11 +5,11 @@
 address. Only `page` and `server` know viser.
 """
 
+from jaxbox.viewer.config_text import config_text
 from jaxbox.viewer.frames import Frame, Frames
 from jaxbox.viewer.scene import COLORINGS, Scene, View, build_scene
 from jaxbox.viewer.serving import open_viewer
 from jaxbox.viewer.session import Session, Shown
-from jaxbox.viewer.settings_text import settings_text
 from jaxbox.viewer.thresholds import THRESHOLDS, Threshold
 from jaxbox.viewer.viewer import Viewer, Wanted
 
@@ -26,6 +26,6 @@ __all__ = [
     "Viewer",
     "Wanted",
     "build_scene",
+    "config_text",
     "open_viewer",
-    "settings_text",
 ]

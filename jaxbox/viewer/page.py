@@ -293,9 +293,9 @@ def _look(client: Any, name: str) -> None:
 
 def _act(action: str, client: Any, viewer: Viewer) -> None:
     if action == _COPY:
-        _show_settings(client, viewer.wanted.settings_text)
+        _show_settings(client, viewer.wanted.config_text)
     elif action == _DOWNLOAD:
-        client.send_file_download(SETTINGS_NAME, viewer.wanted.settings_text.encode(), save_immediately=True)
+        client.send_file_download(SETTINGS_NAME, viewer.wanted.config_text.encode(), save_immediately=True)
     else:
         viewer.want(changes={})
 

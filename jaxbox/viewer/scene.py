@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from jaxbox.config import DEFAULT_CUT
+from jaxbox.config import DEFAULT_SCORE_THRESHOLD
 from jaxbox.types import Detections
 from jaxbox.viewer.frames import Frame
 from jaxbox.viz import BoxGroup, BoxSet, color_by_height, color_by_id, draw_image_boxes
@@ -29,7 +29,7 @@ class View:
 
     coloring: str = "height"
     """What the colours of the points mean: one of `COLORINGS`."""
-    min_score: float = DEFAULT_CUT
+    min_score: float = DEFAULT_SCORE_THRESHOLD
     """Boxes that score less are hidden."""
     boxes: bool = True
     """Whether boxes are drawn."""

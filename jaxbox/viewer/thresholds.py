@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 
 from jaxbox.config import DetectorConfig
-from jaxbox.config.fields import traced_settings
+from jaxbox.config.fields import traced_fields
 
 
 def _always(_: DetectorConfig) -> bool:
@@ -56,7 +56,7 @@ class Threshold:
         >>> THRESHOLDS["ground"][0].value(DetectorConfig())
         0.1
         """
-        return float(traced_settings(config)[self.name])
+        return float(traced_fields(config)[self.name])
 
 
 THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
@@ -222,7 +222,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
             step=0.5,
         ),
         Threshold(
-            name="vehicles.upright_worth",
+            name="vehicles.upright_score",
             label="upright",
             hint="Worth of a box whose upper points are all on its faces, such as a wall's or a hedge's.",
             low=0.0,

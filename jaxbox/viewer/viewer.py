@@ -12,13 +12,13 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 from jaxbox.config import DetectorConfig
-from jaxbox.config.fields import preset_settings, replace_settings
+from jaxbox.config.fields import preset_config, replace_fields
 from jaxbox.io import InputError
 from jaxbox.viewer import words
+from jaxbox.viewer.config_text import config_text
 from jaxbox.viewer.frames import Frame
 from jaxbox.viewer.scene import Scene, View, build_scene
 from jaxbox.viewer.session import Session
-from jaxbox.viewer.settings_text import settings_text
 
 SWEEPS_PER_S = 10.0
 """Rate of playing to begin with: that of most sensors."""
@@ -50,14 +50,14 @@ class Wanted:
         Raises:
           ValueError: for a change that does not fit.
         """
-        base = self.given if self.preset is None else preset_settings(self.preset)
+        base = self.given if self.preset is None else preset_config(self.preset)
         assert base is not None, "settings of no preset must be given"
-        return replace_settings(base, self.changes)
+        return replace_fields(base, self.changes)
 
     @property
-    def settings_text(self) -> str:
-        """The settings as TOML, see `jaxbox.viewer.settings_text`."""
-        return settings_text(self.config, self.preset, min_score=self.view.min_score)
+    def config_text(self) -> str:
+        """The settings as TOML, see `jaxbox.viewer.config_text`."""
+        return config_text(self.config, self.preset, min_score=self.view.min_score)
 
 
 class Page(Protocol):

@@ -67,9 +67,7 @@ class BoxSet:
         score = np.asarray(detections.score, np.float64)
         keep = np.asarray(detections.valid) & (score >= min_score)
         labels = np.asarray(detections.label)[keep]
-        captions = [
-            f"{Label(label).name.lower()} {s:.2f}" for label, s in zip(labels, score[keep], strict=True)
-        ]
+        captions = [f"{Label(label).word} {s:.2f}" for label, s in zip(labels, score[keep], strict=True)]
         return cls(
             center=np.asarray(detections.center)[keep],
             size=np.asarray(detections.size)[keep],

@@ -11,6 +11,7 @@ from jaxbox.evaluation.iou import pairwise_overlaps
 from jaxbox.evaluation.kitti import camera_boxes
 from jaxbox.evaluation.matching import RATE_OVERLAPS, Scene, cut, judge
 from jaxbox.io import KittiObject, boxes_from_objects
+from jaxbox.io.kitti import VEHICLE_TYPES
 from jaxbox.types import Calibration
 from jaxbox.viz.bird_eye import SENSOR_HEIGHT_M, BirdEyeFrame, draw_bird_eye
 from jaxbox.viz.boxes import BoxGroup, BoxSet
@@ -46,7 +47,6 @@ VIEW_X_M, VIEW_Y_M = (-2.0, 78.0), (-30.0, 30.0)
 """What the view from above shows: KITTI labels only what the camera sees."""
 STRIP_PX = 26
 """Height of the line above the pictures."""
-LABELLED_TYPES = ("Car", "Van", "Truck")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -140,7 +140,7 @@ def _other_detections(results: Sequence[KittiObject], judged: np.ndarray, min_sc
     """Rows of the vehicles that score enough and are neither right nor wrong."""
     rows = set(range(len(results))) - set(judged.tolist())
     kept = [row for row in sorted(rows) if (results[row].score or 0.0) >= min_score]
-    return np.array([row for row in kept if results[row].type in LABELLED_TYPES], int)
+    return np.array([row for row in kept if results[row].type in VEHICLE_TYPES], int)
 
 
 def _take(
@@ -154,7 +154,7 @@ def _miss_captions(
     missed: Sequence[KittiObject], num_points: np.ndarray, results: Sequence[KittiObject]
 ) -> list[str]:
     """The points of each missed label, and the best box on it, of another class or too low a score."""
-    vehicles = [item for item in results if item.type in LABELLED_TYPES]
+    vehicles = [item for item in results if item.type in VEHICLE_TYPES]
     overlaps, _ = pairwise_overlaps(camera_boxes(missed), camera_boxes(vehicles))
     captions = []
     for count, row in zip(num_points, overlaps, strict=True):

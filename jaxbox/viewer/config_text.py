@@ -4,10 +4,10 @@ import json
 from typing import Any
 
 from jaxbox.config import DetectorConfig
-from jaxbox.config.fields import NO_VALUE, PRESET_KEY, changed_settings, settings_to_toml
+from jaxbox.config.fields import NO_VALUE, PRESET_KEY, changed_fields, config_to_toml
 
 
-def settings_text(config: DetectorConfig, preset: str | None, *, min_score: float) -> str:
+def config_text(config: DetectorConfig, preset: str | None, *, min_score: float) -> str:
     """Writes settings as TOML, as short as it goes.
 
     Args:
@@ -18,15 +18,15 @@ def settings_text(config: DetectorConfig, preset: str | None, *, min_score: floa
     Returns:
       TOML, from which `jaxbox.io.read_config` makes the same settings.
 
-    >>> print(settings_text(DetectorConfig.paper(), "paper", min_score=0.2))
+    >>> print(config_text(DetectorConfig.paper(), "paper", min_score=0.2))
     # jaxbox detect SWEEPS --output out --config THIS_FILE --min-score 0.2
     preset = "paper"
     <BLANKLINE>
     """
     command = f"# jaxbox detect SWEEPS --output out --config THIS_FILE --min-score {min_score:g}\n"
     if preset is None:
-        return command + settings_to_toml(config)
-    changes = changed_settings(config, DetectorConfig.presets()[preset])
+        return command + config_to_toml(config)
+    changes = changed_fields(config, DetectorConfig.presets()[preset])
     lines = [f"{name} = {_toml_value(value)}\n" for name, value in {PRESET_KEY: preset, **changes}.items()]
     return command + "".join(lines)
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from jaxbox.config import DetectorConfig
 from jaxbox.config.checks import check_config
-from jaxbox.config.fields import all_settings, base_of, parse_change, preset_settings, replace_settings
+from jaxbox.config.fields import all_fields, base_of, parse_change, preset_config, replace_fields
 from jaxbox.io import InputError, read_config
 from jaxbox.io.config import read_preset
 
@@ -34,7 +34,7 @@ def chosen_config(
         or settings that contradict each other.
     """
     try:
-        base = None if preset is None else preset_settings(preset)
+        base = None if preset is None else preset_config(preset)
     except ValueError as error:
         raise InputError(f"--preset {error}") from error
     try:
@@ -43,7 +43,7 @@ def chosen_config(
         raise InputError(f"--sensor {error}") from error
     config = fitted if file is None else read_config(file, base=base, sensor=sensor)
     try:
-        config = replace_settings(config, dict(parse_change(change) for change in changes))
+        config = replace_fields(config, dict(parse_change(change) for change in changes))
     except ValueError as error:
         raise InputError(f"--set: {error}") from error
     try:
@@ -86,4 +86,4 @@ def complete_setting(incomplete: str) -> list[str]:
     >>> complete_setting("ground.tol")
     ['ground.tolerance_m=']
     """
-    return [f"{name}=" for name in all_settings(DetectorConfig()) if name.startswith(incomplete)]
+    return [f"{name}=" for name in all_fields(DetectorConfig()) if name.startswith(incomplete)]

@@ -8,13 +8,13 @@ import pytest
 from jaxbox import io
 from jaxbox.config import ComponentMap, DetectorConfig
 from jaxbox.config.fields import (
-    changed_settings,
+    changed_fields,
     check_traced,
+    config_from_toml,
+    config_to_toml,
     parse_change,
-    replace_settings,
-    settings_from_toml,
-    settings_to_toml,
-    traced_settings,
+    replace_fields,
+    traced_fields,
 )
 
 PRESETS = list(DetectorConfig.presets().values())
@@ -22,13 +22,13 @@ PRESETS = list(DetectorConfig.presets().values())
 
 @pytest.mark.parametrize("config", PRESETS, ids=DetectorConfig.presets())
 def test_the_traced_settings_are_the_leaves_that_jit_sees(config):
-    assert list(traced_settings(config).values()) == jax.tree.leaves(config)
+    assert list(traced_fields(config).values()) == jax.tree.leaves(config)
 
 
 @pytest.mark.parametrize("config", PRESETS, ids=DetectorConfig.presets())
 def test_each_traced_setting_reaches_its_own_leaf_and_no_other(config):
-    for position, name in enumerate(traced_settings(config)):
-        changed = replace_settings(config, {name: 123.25})
+    for position, name in enumerate(traced_fields(config)):
+        changed = replace_fields(config, {name: 123.25})
         differing = [
             i for i, pair in enumerate(zip(jax.tree.leaves(config), jax.tree.leaves(changed), strict=True))
             if pair[0] != pair[1]
@@ -39,7 +39,7 @@ def test_each_traced_setting_reaches_its_own_leaf_and_no_other(config):
 
 def test_several_changes_are_made_together_and_the_rest_stays():
     base = DetectorConfig()
-    changed = replace_settings(base, {"box.criterion": "closeness", "clustering.maps.2.min_height_m": 0.4})
+    changed = replace_fields(base, {"box.criterion": "closeness", "clustering.maps.2.min_height_m": 0.4})
     assert changed.box == dataclasses.replace(base.box, criterion="closeness")
     assert changed.clustering.maps[2].min_height_m == 0.4
     assert changed.clustering.maps[:2] == base.clustering.maps[:2]
@@ -49,8 +49,8 @@ def test_several_changes_are_made_together_and_the_rest_stays():
 def test_what_was_changed_is_what_changes_the_base_into_it():
     changes = {"box.criterion": "closeness", "clustering.maps.2.min_height_m": 0.4, "box.max_slab_points": 9}
     base = DetectorConfig()
-    assert changed_settings(replace_settings(base, changes), base) == changes
-    assert changed_settings(base, base) == {}
+    assert changed_fields(replace_fields(base, changes), base) == changes
+    assert changed_fields(base, base) == {}
 
 
 @pytest.mark.parametrize(
@@ -70,7 +70,7 @@ def test_what_was_changed_is_what_changes_the_base_into_it():
 )
 def test_a_change_that_cannot_be_made_is_refused_by_name(name, value, expected):
     with pytest.raises(ValueError, match=expected) as error:
-        replace_settings(DetectorConfig(), {name: value})
+        replace_fields(DetectorConfig(), {name: value})
     assert name in str(error.value)
 
 
@@ -96,14 +96,14 @@ def test_a_change_is_a_literal_or_a_word():
 @pytest.mark.parametrize("config", PRESETS, ids=DetectorConfig.presets())
 @pytest.mark.parametrize("base", PRESETS, ids=DetectorConfig.presets())
 def test_a_written_file_makes_the_same_settings_from_any_base(tmp_path, config, base):
-    config = replace_settings(config, {"clustering.max_obstacles": 9, "vehicles.min_score": 1e-9})
-    assert settings_from_toml(settings_to_toml(config), base=base) == config
+    config = replace_fields(config, {"clustering.max_obstacles": 9, "vehicles.min_score": 1e-9})
+    assert config_from_toml(config_to_toml(config), base=base) == config
     io.write_config(tmp_path / "a.toml", config)
     assert io.read_config(tmp_path / "a.toml", base=base) == config
 
 
 def test_tables_dotted_names_and_arrays_of_tables_say_the_same():
-    changed = replace_settings(
+    changed = replace_fields(
         DetectorConfig(), {"vehicles.min_score": 0.5, "clustering.maps.1.min_height_m": 0.4}
     )
     for text in (
@@ -112,21 +112,21 @@ def test_tables_dotted_names_and_arrays_of_tables_say_the_same():
         "vehicles.min_score = 0.5\nclustering.maps.1.min_height_m = 0.4\n",
         '"vehicles.min_score" = 0.5\n"clustering.maps.1.min_height_m" = 0.4\n',
     ):
-        assert settings_from_toml(text) == changed
+        assert config_from_toml(text) == changed
 
 
 def test_a_file_names_its_preset_and_its_arrays_set_their_length():
-    assert settings_from_toml('preset = "paper"') == DetectorConfig.paper()
-    assert settings_from_toml('preset = "paper"', base=DetectorConfig()) == DetectorConfig()
-    maps = settings_from_toml("[[clustering.maps]]\n" * 4).clustering.maps
+    assert config_from_toml('preset = "paper"') == DetectorConfig.paper()
+    assert config_from_toml('preset = "paper"', base=DetectorConfig()) == DetectorConfig()
+    maps = config_from_toml("[[clustering.maps]]\n" * 4).clustering.maps
     assert maps == (*DetectorConfig().clustering.maps, ComponentMap())
-    assert settings_from_toml('box.max_slab_points = "none"').box.max_slab_points is None
+    assert config_from_toml('box.max_slab_points = "none"').box.max_slab_points is None
 
 
 def test_a_whole_number_for_a_threshold_compiles_nothing_anew():
-    changed = settings_from_toml("vehicles.ring_weight = 7")
+    changed = config_from_toml("vehicles.ring_weight = 7")
     assert type(changed.vehicles.ring_weight) is float
-    assert type(replace_settings(changed, {"region.half_x_m": 70}).region.half_x_m) is float
+    assert type(replace_fields(changed, {"region.half_x_m": 70}).region.half_x_m) is float
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,59 @@
+"""Another vehicle class is one entry in one file: a copy of the package gets a bus, and all else knows it."""
+
+import os
+import pathlib
+import re
+import shutil
+import subprocess
+import sys
+
+import jaxbox
+from jaxbox import DetectorConfig, Label
+
+PACKAGE = pathlib.Path(jaxbox.__file__).parent
+TABLE = pathlib.Path("config", "class_priors.py")
+"""The one file, in the package."""
+TESTS = pathlib.Path(__file__).parent
+
+
+def copy_with_a_bus(folder):
+    """A copy of the package in whose table a bus comes last: the truck's entry, somewhat longer."""
+    shutil.copytree(PACKAGE, folder / "jaxbox", ignore=shutil.ignore_patterns("__pycache__"))
+    table = folder / "jaxbox" / TABLE
+    text = table.read_text()
+    (truck,) = re.findall(r"^    TRUCK = ClassPrior\(.*?^    \)\n", text, re.MULTILINE | re.DOTALL)
+    assert text.endswith(truck), "classes are added at the end"
+    table.write_text(text + truck.replace("TRUCK", "BUS").replace("10.81", "12.0"))
+
+
+def test_another_class_is_one_entry_in_one_file(tmp_path):
+    copy_with_a_bus(tmp_path)
+    result = subprocess.run(
+        [sys.executable, TESTS / "four_classes.py", tmp_path],
+        env=os.environ | {"PYTHONPATH": str(tmp_path)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+
+
+def test_the_priors_of_the_configuration_are_those_of_the_labels_in_their_order():
+    assert DetectorConfig().vehicles.classes == tuple(label.prior for label in Label)
+    assert [int(label) for label in Label] == list(range(len(Label)))
+
+
+NAMED = re.compile(r"\bLabel\.(?:VAN|TRUCK)\b|[\"'](?:van|truck|Van|Truck)[\"']")
+OWN = {
+    "evaluation/kitti.py": "the benchmark's own rule for vans",
+    "io/foxglove.py": "chosen colours",
+    "synthetic/scene.py": "sizes and shares of a street's vehicles",
+    "synthetic/solids.py": "shapes",
+}
+"""What some classes have to themselves; another class gets what no class in particular has."""
+
+
+def test_no_other_file_names_a_class_but_those_where_one_has_something_of_its_own():
+    files = {path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py") if NAMED.search(path.read_text())}
+    assert {file.as_posix() for file in files - {TABLE}} == set(OWN)
