@@ -28,6 +28,7 @@ FAST = {
 """Files whose tests make up ``pytest -m fast``, but for the tests in `SLOW`."""
 SLOW = {
     "rounds",
+    "test_the_pipeline_strip_is_of_this_detector",
     "test_the_proposed_capacities_hold_the_sweeps_they_were_proposed_for",
     "test_the_readme_python_example_runs",
     "test_the_rough_look_at_real_sweeps_proposes_enough",

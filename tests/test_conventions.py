@@ -186,6 +186,28 @@ def readme():
     return (PROJECT / "README.md").read_text()
 
 
+MAX_README_WORDS = 450
+
+
+def prose(text):
+    """The words of a Markdown page: without code, tables, pictures, and the targets of links."""
+    text = re.sub(r"^```.*?^```", "", text, flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(r"^\|.*$", "", text, flags=re.MULTILINE)
+    text = re.sub(r"!\[[^\]]*\]\([^)]*\)", "", text)
+    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", text)
+    return [word for word in text.split() if re.search(r"\w", word)]
+
+
+def test_the_readme_is_short():
+    words = len(prose(readme()))
+    assert words <= MAX_README_WORDS, f"{words} words: move some to docs/"
+
+
+def test_words_of_a_page_are_those_of_its_prose():
+    page = "# One two\n\n```bash\nno no\n```\n\n| no | no |\n|---|---|\n\n![no](no.png) [three four](no.md) -"
+    assert prose(page) == ["One", "two", "three", "four"]
+
+
 def test_the_readme_python_example_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     examples = re.findall(r"```python\n(.*?)```", readme(), re.DOTALL)

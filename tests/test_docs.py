@@ -4,21 +4,28 @@ import importlib.util
 import pathlib
 import re
 
+import numpy as np
 import pytest
 
 import jaxbox
 from jaxbox import DetectorConfig
 from jaxbox.config import fields
+from jaxbox.io.images import read_image
 
 PROJECT = pathlib.Path(__file__).parents[1]
 
 
-def hook(name):
-    """A module of docs/hooks, which is no package."""
-    spec = importlib.util.spec_from_file_location(f"docs_{name}", PROJECT / "docs" / "hooks" / f"{name}.py")
+def load(path):
+    """A module that belongs to no package."""
+    spec = importlib.util.spec_from_file_location(f"{path.parent.name}_{path.stem}", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def hook(name):
+    """A module of docs/hooks."""
+    return load(PROJECT / "docs" / "hooks" / f"{name}.py")
 
 
 def fence_doctests(text):
@@ -82,3 +89,19 @@ def test_links_of_the_projects_files_lead_within_the_site_or_are_words():
     text = "[a](docs/install.md) [b](CHANGELOG.md) [c](LICENSE) [d](https://e.org)"
     links = hook("project_pages").with_links_of_the_site(text)
     assert links == "[a](install.md) [b](changelog.md) c [d](https://e.org)"
+
+
+def test_the_pipeline_strip_is_of_this_detector(tmp_path):
+    load(PROJECT / "examples" / "pipeline_strip.py").main([str(tmp_path / "strip.png")])
+    drawn, shown = read_image(tmp_path / "strip.png"), read_image(PROJECT / "docs" / "pipeline.png")
+    assert drawn.shape == shown.shape
+    # Another processor rounds differently, which may move an edge by a pixel.
+    differing = np.any(drawn != shown, axis=-1).mean()
+    assert differing < 0.001, "python examples/pipeline_strip.py docs/pipeline.png"
+
+
+def test_the_pages_of_the_navigation_are_the_pages_that_exist():
+    named = set(re.findall(r"[\w/]+\.md", (PROJECT / "mkdocs.yml").read_text()))
+    made = set(hook("project_pages").PAGES.values())
+    docs = PROJECT / "docs"
+    assert named - made == {path.relative_to(docs).as_posix() for path in docs.rglob("*.md")}
