@@ -25,7 +25,7 @@ FULL = "default preset"
 NO_LIMIT = 1e6
 """A width or a gate that no value reaches."""
 MORE_POINTS = {"clustering.max_obstacles": 131072, "box.max_slab_points": 65536}
-"""Room for rows that take more points for obstacles, or fit to more: theirs is no error of capacity."""
+"""Room for rows that take more points for obstacles, or fit to more: theirs is not an error of capacity."""
 MORE_DETECTIONS = {"vehicles.max_detections": 512}
 """Room for rows that reject less."""
 
@@ -180,7 +180,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         action="append",
         choices=[ablation.name for ablation in ABLATIONS],
         metavar="NAME",
-        help="only this row, beside the full preset; repeat for more",
+        help="only this row, next to the full preset; repeat for more",
     )
     options = parser.parse_args(arguments)
     chosen = [ablation for ablation in ABLATIONS if not options.only or ablation.name in options.only]

@@ -2,7 +2,7 @@
 
 Few labelled frames make a noisy figure: one borderline car is some points of average precision, and turning
 the input by a few degrees moves it as much. Turned and mirrored copies are as good sweeps as the recorded
-one, so a difference between two settings is judged by their mean beside their spread.
+one, so a difference between two settings is judged by their mean next to their spread.
 
     python -m benchmarks.bench_accuracy --copies 6 --set vehicles.max_overlap=0.2 --json accuracy.json
 """
@@ -24,7 +24,7 @@ METRICS = ("bev", "3d")
 RECALLS = (("bev", 0.5), ("bev", 0.7), ("3d", 0.7))
 MIN_OVERLAP = {"Car": kitti.MIN_OVERLAP["Car"]}
 WELL_SEEN_POINTS = 50
-"""Cars with so many points must not have their axes swapped."""
+"""Cars with that many points must not have their axes swapped."""
 
 
 def detect_frames(

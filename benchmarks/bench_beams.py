@@ -30,7 +30,7 @@ from jaxbox.synthetic import SyntheticSweep, make_sweep
 
 DRIVES_FILE = common.PROJECT / "benchmarks" / "kitti_drives.txt"
 FIRSTS: Mapping[int, tuple[int, ...]] = {64: (0,), 32: (0, 1), 16: (0, 2)}
-"""The first beam that is kept: several sensors of so many beams in one sweep."""
+"""The first beam that is kept: several sensors of that many beams in one sweep."""
 DENSEST = 128
 SYNTHETIC_BEAMS = (128, 64, 32, 16)
 SYNTHETIC_MIN_POINTS = 20

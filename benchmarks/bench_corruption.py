@@ -3,8 +3,8 @@
     python -m benchmarks.bench_corruption [--only beams fog] [--copies 3] [--json FILE] [--plot PICTURE]
     python -m benchmarks.bench_corruption --redraw FILE --plot PICTURE    # of an earlier report
 
-Each kind of `jaxbox.evaluation.corruptions` at five severities, beside the clean sweeps. A figure is the
-mean over turned and mirrored copies, see `bench_accuracy`; each copy is corrupted anew, with seeds of its
+Each kind of `jaxbox.evaluation.corruptions` at five severities, next to the clean sweeps. A figure is the
+mean over turned and mirrored copies, see `bench_accuracy`; each copy is corrupted again, with seeds of its
 own. Where the calibration is corrupted the labels stay as they are: the boxes then are where the LiDAR has
 them, and what is measured is how far a wrong calibration carries them off in the camera's frame, in which
 KITTI's labels are.

@@ -1,4 +1,4 @@
-"""Ground points: the detector's mask beside Patchwork++ on labelled, mapped and synthetic ground.
+"""Ground points: the detector's mask next to Patchwork++ on labelled, mapped and synthetic ground.
 
 On SemanticKITTI after Patchwork++'s protocol: road, parking, sidewalk, other ground, lane marking and terrain
 are ground; vegetation and unlabelled points are not judged. On synthetic streets against the exact mask, and

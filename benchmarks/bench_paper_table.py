@@ -1,4 +1,4 @@
-"""The paper's own table: one vehicle's dimensions over five consecutive frames, beside the paper's figures.
+"""The paper's own table: one vehicle's dimensions over five consecutive frames, next to the paper's figures.
 
     python -m benchmarks.bench_paper_table --json paper_table.json
 
@@ -9,7 +9,7 @@ five consecutive ones of them.
 
 Vehicles are of nearly one size, so always answering the median of the class does well in each of these
 measures. And as length, width and height differ by metres, the pooled correlation of any plausible answer
-is near 1. The paper's row means something only beside the constant's.
+is near 1. The paper's row means something only next to the constant's.
 """
 
 import argparse

@@ -120,7 +120,7 @@ def repeated(sweeps: Sequence[Sweep], count: int) -> Iterator[Sweep]:
 
 
 def use(cores: int, devices: int) -> Sequence[Any]:
-    """Holds this process to so many cores, and to so many devices, which it returns."""
+    """Holds this process to that many cores, and to that many devices, which it returns."""
     os.sched_setaffinity(0, set(sorted(os.sched_getaffinity(0))[:cores]))
     # Devices of a CPU: as many as JAX is asked for when it starts.
     jax.config.update("jax_num_cpu_devices", devices)
@@ -128,7 +128,7 @@ def use(cores: int, devices: int) -> Sequence[Any]:
 
 
 def rate_of_batch(sweeps: Sequence[Sweep], preset: str, count: int, cores: int, num_devices: int) -> float:
-    """Sweeps a second of `detect_batch`, from arrays on the device, with so many cores and devices."""
+    """Sweeps a second of `detect_batch`, from arrays on the device, with that many cores and devices."""
     devices = use(cores, num_devices)
     config = DetectorConfig.presets()[preset]
     clouds = [PointCloud.from_numpy(*sweep.read_points()) for sweep in sweeps]

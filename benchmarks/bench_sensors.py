@@ -1,6 +1,6 @@
 """Vehicles on sweeps labelled all round: Argoverse 2, PandaSet, SemanticKITTI; nothing was tuned on them.
 
-KITTI's labels hold only what one camera sees, so there a false alarm beside or behind the car costs nothing.
+KITTI's labels hold only what one camera sees, so there a false alarm next to or behind the car costs nothing.
 These labels go all round: a detection that overlaps no vehicle's label is a false alarm. SemanticKITTI has
 no boxes but a class for every point: there a detection is right where most of its points are a vehicle's.
 
@@ -36,7 +36,7 @@ from jaxbox.io import (
 
 MIN_POINTS = 30
 MAX_RANGE_M = 40.0
-"""Labels nearer than this with so many points are to be found."""
+"""Labels nearer than this with that many points are to be found."""
 RECALL_OVERLAP = 0.5
 REPEATED_OVERLAP = 0.9
 TRUE_OVERLAPS = (0.1, 0.3, 0.5)
@@ -44,7 +44,7 @@ TRUE_OVERLAPS = (0.1, 0.3, 0.5)
 RIGHT_OVERLAP = 0.3
 """The one of them that the cut is chosen by: of two equal boxes, one shifted by half its length has 0.33."""
 RIGHT_SHARE = 0.5
-"""Where points have classes: so many of a detection's are a vehicle's, or of a vehicle's the detection's."""
+"""Where points have classes: this share of a detection's are a vehicle's, or the other way round."""
 UNLABELLED_CLASSES = frozenset({0, 1})
 """SemanticKITTI's unlabelled points and outliers, most of those far away: a detection there is not judged."""
 CAR_POINT_CLASSES = frozenset({10, 252})
@@ -111,7 +111,7 @@ DATA_SETS: Mapping[str, Callable[[], list[LabelledSweep]]] = {
 
 
 def measure(sweep: LabelledSweep, found: Detections) -> dict[str, Any]:
-    """What was found of one sweep's labels, and what was found beside them."""
+    """What was found of one sweep's labels, and what was found besides them."""
     boxes = sweep.boxes
     valid = np.asarray(found.valid)
     score = np.asarray(found.score)[valid]

@@ -1,4 +1,4 @@
-"""Times detect() on real sweeps, whole and step by step, beside what the machine could do at the best.
+"""Times detect() on real sweeps, whole and step by step, next to what the machine could do at the best.
 
     python -m benchmarks.bench_stages [--preset paper] [--quick] [--json FILE]
 

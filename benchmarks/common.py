@@ -44,7 +44,7 @@ def data_folder(name: str) -> pathlib.Path:
 
 
 def kitti_sweeps(limit: int | None = None) -> list[Sweep]:
-    """Real sweeps of the three KITTI data sets; evenly spread ones where only so many are wanted."""
+    """Real sweeps of the three KITTI data sets; evenly spread ones where only that many are wanted."""
     folders = [data_folder(SWEEP_SETS[0])]
     folders += [folder for name in SWEEP_SETS[1:] if (folder := folders[0].parent / name).is_dir()]
     sweeps = [sweep for folder in folders for sweep in open_sweeps(folder)]
@@ -102,7 +102,7 @@ def status_names(statuses: Sequence[int]) -> list[str]:
 
 
 def circumstances(options: argparse.Namespace) -> dict[str, Any]:
-    """What a figure depends on beside the code: settings, commit, versions and machine."""
+    """What a figure depends on besides the code: settings, commit, versions and machine."""
     # The place of a file says nothing of the figures.
     chosen = {
         name: value.name if isinstance(value, pathlib.Path) else value

@@ -75,7 +75,7 @@ def prepare() -> None:
 
 
 def install_command(version: str) -> str:
-    """The command that installs the compiler beside a version of jax."""
+    """The command that installs the compiler next to a version of jax."""
     return "pip install " + " ".join([*(f"{name}=={version}" for name in WHEELS[:2]), WHEELS[2]])
 
 

@@ -114,7 +114,7 @@ class Computation:
         return readers
 
     def size(self, name: str) -> int:
-        """Size of a result; 0 where the name is no instruction of the computation."""
+        """Size of a result; 0 where the name is not an instruction of the computation."""
         return bytes_of(self.lines[name].shape) if name in self.lines else 0
 
     def read(self, name: str) -> int:

@@ -27,7 +27,7 @@ from jaxbox.run.summary import Summary
 FAST_SWEEPS, SLOW_SWEEPS = 4, 100
 """Sweeps over which the two means forget."""
 WARM_UP_SWEEPS = 5
-"""No drift is judged before so many."""
+"""No drift is judged before that many."""
 LIMITS = {
     "sensor_height_m": 0.15,  # a mount that sinks, a load, a kerb under one wheel
     "tilt_deg": 1.0,
@@ -48,7 +48,7 @@ SERIOUS = ~(Status.NONFINITE_POINTS | Status.HULL_OVERFLOW)
 
 @dataclasses.dataclass
 class Mean:
-    """An exponentially weighted mean over about so many sweeps; the plain mean until there are as many."""
+    """An exponentially weighted mean over about that many sweeps; the plain mean until there are as many."""
 
     sweeps: int
     value: float = 0.0

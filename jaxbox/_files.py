@@ -18,7 +18,7 @@ else:
 
 
 class InputError(ValueError):
-    """A file or folder that cannot be used; the message names it, the line or field, and the mend."""
+    """A file or folder that cannot be used; the message names it, the line or field, and the fix."""
 
 
 MAX_SWEEP_BYTES = 2**30

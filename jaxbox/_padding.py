@@ -15,7 +15,7 @@ BLOCK_ROWS = 8192
 
 
 def fitting_capacity(num_points: int) -> int:
-    """The smallest of `CAPACITY_BUCKETS` that holds so many points, or the largest bucket.
+    """The smallest of `CAPACITY_BUCKETS` that holds that many points, or the largest bucket.
 
     Args:
       num_points: of a sweep.

@@ -172,7 +172,7 @@ def _places(count: int, step_m: float) -> np.ndarray:
 
 
 def _rails(count: int, points: int, top_m: float, step_m: float) -> np.ndarray:
-    """Rails that rise from the ground over a metre, so many points each."""
+    """Rails that rise from the ground over a metre, that many points each."""
     height = np.linspace(0.3, top_m, points) - 1.7
     xy = np.repeat(_places(count, step_m), points, axis=0)
     xy[:, 0] += np.tile(np.linspace(0, 1.05, points), count)
@@ -187,7 +187,7 @@ def _disc(count: int) -> np.ndarray:
 
 
 def _million() -> Points:
-    """A street so often over, each time a little beside itself."""
+    """A street so often over, each time a little next to itself."""
     xyz = np.resize(street(), (MILLION, 3))
     return xyz + np.random.default_rng(0).normal(0, 0.02, xyz.shape).astype(np.float32), None
 

@@ -33,13 +33,13 @@ NUM_SWEEPS = 3
 SAME_OBJECT_OVERLAP = 0.1
 """Boxes of two keys that overlap more are of one object; within one answer none overlap so much."""
 OFTEN = 0.9
-"""An object is often there where so many of the keys find it."""
+"""An object is often there where that many of the keys find it."""
 TIMEOUT_S = 3600
 
 NO_CACHE = {"JAXBOX_CACHE_DIR": "", "JAX_ENABLE_COMPILATION_CACHE": "false"}
 PROCESSES: Mapping[str, Mapping[str, str]] = {
     "another process": {},
-    "compiled anew": NO_CACHE,
+    "compiled again": NO_CACHE,
     "NPROC=1": {THREADS_VARIABLE: "1"},
     "NPROC=2": {THREADS_VARIABLE: "2"},
     "--xla_cpu_multi_thread_eigen=false": {"XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false"},

@@ -58,7 +58,7 @@ def command(sweeps: pathlib.Path, output: pathlib.Path, *options: str) -> list[s
 
 
 def run(words: list[str], *, kill_after: tuple[int, float] | None = None) -> int:
-    """Runs a command, killed so many seconds after so many of its lines about a sweep; its exit code.
+    """Runs a command, killed that many seconds after that many of its lines about a sweep; its exit code.
 
     Moments are counted in sweeps rather than seconds because most of a short run is its start.
     """
@@ -113,7 +113,7 @@ def stage_of(killed: pathlib.Path, num_done: int, num_sweeps: int) -> str:
 
 
 def kill_and_resume(sweeps: pathlib.Path, root: pathlib.Path, *, kills: int, seed: int) -> dict[str, Any]:
-    """Runs undisturbed, then killed and resumed so many times.
+    """Runs undisturbed, then killed and resumed that many times.
 
     Args:
       sweeps: of `write_sweeps`.
@@ -145,7 +145,7 @@ def kill_and_resume(sweeps: pathlib.Path, root: pathlib.Path, *, kills: int, see
         elif code:
             raise SystemExit(f"a resumed run ended with exit code {code}")
         else:
-            # It has nothing left to do: the next begins anew.
+            # It has nothing left to do: the next begins again.
             num_ended += 1
             (killed / "detections.parquet").unlink()
     code = run(command(sweeps, killed, "--resume"))

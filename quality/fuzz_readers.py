@@ -4,12 +4,12 @@
 
 libFuzzer, by way of Atheris (``pip install atheris``, not a dependency), changes small files that the
 formats' own libraries wrote (`fuzz_targets`), and keeps what reaches new code of the reader or its library.
-The readers take their turns in processes of their own, on one core. What one raises beside
+The readers take their turns in processes of their own, on one core. What one raises besides
 `jaxbox.io.InputError`, a warning included, is kept once a place in the code as ``DIR/NAME/findings/*``; bytes
 that hang it, end its process or ask for too much memory are kept too, and count where reading them once more
 does the same.
 
-A finding, once mended, goes to ``tests/corpus/NAME``, which the tests read. Where the file of ``--json`` is
+A finding, once fixed, goes to ``tests/corpus/NAME``, which the tests read. Where the file of ``--json`` is
 there, its minutes and executions are added to, reader by reader.
 """
 

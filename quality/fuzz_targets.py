@@ -156,7 +156,7 @@ def write_feather_calibration(folder: pathlib.Path) -> None:
 
 
 def read_calibrated_feather(path: pathlib.Path) -> None:
-    """A good sweep beside a calibration of these bytes."""
+    """A good sweep next to a calibration of these bytes."""
     check_points(*io.read_points(path.parents[1] / "sensors" / "lidar" / "1.feather"))
 
 
@@ -302,7 +302,7 @@ RAW_CALIBRATION = {
 
 
 def raw_calibration_target(name: str) -> Target:
-    """One of the two files, beside a good other one."""
+    """One of the two files, next to a good other one."""
 
     def write_other(folder: pathlib.Path) -> None:
         for other, text in RAW_CALIBRATION.items():
@@ -313,7 +313,7 @@ def raw_calibration_target(name: str) -> Target:
 
 
 def write_raw_drive(folder: pathlib.Path) -> None:
-    """A sweep of a raw drive, whose times are beside its folder."""
+    """A sweep of a raw drive, whose times are next to its folder."""
     (folder / "data").mkdir(exist_ok=True)
     (folder / "data" / "0000000000.bin").write_bytes(b"")
 
@@ -368,7 +368,7 @@ def run_seeds(folder: pathlib.Path) -> None:
 
 
 def write_run_config(folder: pathlib.Path) -> None:
-    """The settings beside ``run.json``."""
+    """The settings next to ``run.json``."""
     io.write_config(folder / "config.toml", DetectorConfig())
 
 

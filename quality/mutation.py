@@ -5,9 +5,9 @@
 
 Cosmic Ray (`pip install 'jaxbox[quality]'`) changes a sign, a number, a comparison or a condition in a copy
 of the tracked files; the checkout is not touched. A mutant is killed where the fast tests of its module fail,
-or take more than `MAX_CPU_S` of processor time; "timeout" is no verdict. Most mutants compile anew what they
-change, so that one takes some seconds: a seeded sample is drawn of each module. JAX_COMPILATION_CACHE_DIR
-keeps what they share.
+or take more than `MAX_CPU_S` of processor time; "timeout" is not a verdict. Most mutants compile what they
+change again, so that one takes some seconds: a seeded sample is drawn of each module.
+JAX_COMPILATION_CACHE_DIR keeps what they share.
 """
 
 import argparse

@@ -49,7 +49,7 @@ COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"
 
 @dataclasses.dataclass(frozen=True)
 class Resized:
-    """A sweep with so many points, made of another's when it is its turn."""
+    """A sweep with that many points, made of another's when it is its turn."""
 
     name: str
     base: np.ndarray

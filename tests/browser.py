@@ -81,7 +81,7 @@ class Visit:
         return self.page.locator(f"[id='{name.get_attribute('for')}']")
 
     def type_value(self, label: str, value: float) -> None:
-        """Types a number into the field beside a slider."""
+        """Types a number into the field next to a slider."""
         self.control(label).locator("xpath=following-sibling::*//input").fill(f"{value:g}")
 
     def drag(self, label: str, share: float) -> None:

@@ -17,7 +17,7 @@ from quality import bad_input, bad_input_table
 
 CASES = {case.name: case for case in bad_input.CASES}
 HERE = [case.name for case in bad_input.CASES if not case.compiles_anew]
-"""The others compile the whole detector anew, and are run by `bad_input_table`."""
+"""The others compile the whole detector again, and are run by `bad_input_table`."""
 
 
 @functools.cache

@@ -364,10 +364,10 @@ def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_p
     manifest = manifest_of(tmp_path)
     assert (manifest["num_done"], manifest["num_failed"], manifest["num_boxes"]) == (5, 1, len(local))
     assert manifest["deaths"] == {"part-000002": 1}
-    assert "part-000002: a worker died on it; it was begun anew" in result.stderr
+    assert "part-000002: a worker died on it; it was begun again" in result.stderr
     (failure,) = manifest["failures"]
     assert failure["url"] == f"{url}/drive_1/{BROKEN}.bin"
-    assert failure["reason"].startswith(f"{failure['url']}: 17 bytes is no multiple of 16")
+    assert failure["reason"].startswith(f"{failure['url']}: 17 bytes is not a multiple of 16")
     summary = json.loads(result.stdout.splitlines()[-1])["summary"]
     assert summary["done"] == 5
     assert summary["repeated"] == [{"partition": "part-000002", "deaths": 1}]
@@ -375,7 +375,7 @@ def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_p
         "config.toml", "manifest.json", "part-000000.parquet", "part-000001.parquet", "part-000002.parquet",
     ]  # fmt: skip
 
-    # The sweep is mended, and only its partition is done again.
+    # The sweep is fixed, and only its partition is done again.
     server.asked.clear()
     before = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.parquet")}
     shutil.copy(folder / "drive_0" / "000.bin", folder / "drive_1" / f"{BROKEN}.bin")

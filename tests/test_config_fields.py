@@ -75,7 +75,7 @@ def test_a_change_that_cannot_be_made_is_refused_by_name(name, value, expected):
 
 
 def test_a_static_setting_is_no_threshold_and_the_nearest_ones_are_named():
-    with pytest.raises(ValueError, match="compile the detector anew") as error:
+    with pytest.raises(ValueError, match="compile the detector again") as error:
         check_traced(DetectorConfig(), "clustering.maps.0.cell_m")
     assert "clustering.maps.0.min_height_m" in str(error.value)
     with pytest.raises(ValueError, match=r"no setting .*: completion.free_weight"):
@@ -134,7 +134,7 @@ def test_a_whole_number_for_a_threshold_compiles_nothing_anew():
     [
         ("[vehicles]\nmin_scor = 0.5", "no setting vehicles.min_scor; nearest are vehicles.min_score"),
         ("[vehicle]\nmin_score = 0.5", "no setting vehicle.min_score; nearest are vehicles.min_score"),
-        ("[[clustering.mapz]]", "clustering.mapz is no list; nearest lists are clustering.maps"),
+        ("[[clustering.mapz]]", "clustering.mapz is not a list; nearest lists are clustering.maps"),
         ("[[vehicles.classes]]", "vehicles.classes has 1 entries; it must have 3"),
         ("clustering.maps = []", "clustering.maps has 0 entries; it must have at least 1"),
         ("vehicles = 3", "no setting vehicles"),

@@ -46,7 +46,7 @@ def test_boxes_of_other_keys_are_followed_to_the_object_they_are_of():
     assert objects.shape == (2, 3, 8)
     np.testing.assert_array_equal(~np.isnan(objects[..., 0]), [[True, True, False], [False, True, False]])
     moves = determinism.deviations(objects[0, :2])
-    # Two boxes are half their difference from their median; half a turn is no turn.
+    # Two boxes are half their difference from their median; half a turn is not a turn.
     assert moves["centre, m"] == pytest.approx([0.05, 0.05])
     assert moves["yaw, degrees"] == pytest.approx(np.degrees([0.01, 0.01]))
     assert moves["score"] == pytest.approx([0.05, 0.05])

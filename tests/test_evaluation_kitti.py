@@ -115,7 +115,7 @@ def test_a_false_alarm_with_the_best_score_lowers_precision_at_every_recall():
     results = scored(labels)
     results["000000"].append(car(right=15.0, score=1.0))
     curve = kitti.evaluate(labels, results).curve("Car", "3d", "easy")
-    # At sample i, i + 1 cars are found beside one false alarm; the best from there on is at the end.
+    # At sample i, i + 1 cars are found next to one false alarm; the best from there on is at the end.
     np.testing.assert_allclose(curve.precision, 41 / 42)
 
 

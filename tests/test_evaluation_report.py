@@ -151,7 +151,7 @@ def test_a_verdict_marks_each_label_and_detection_once_and_keeps_their_rows():
     ]
     (scene,) = matching.select({"a": labels}, {"a": results}, ALL)
     verdict = matching.judge(scene, metric="bev", min_overlap=0.5)
-    assert scene.label_rows.tolist() == [1, 2, 3], "the pedestrian is no matter of cars"
+    assert scene.label_rows.tolist() == [1, 2, 3], "the pedestrian is not a matter of cars"
     assert scene.detection_rows.tolist() == [0, 2, 3, 4]
     assert verdict.found.tolist() == [True, False, False]
     assert verdict.missed.tolist() == [False, True, False]

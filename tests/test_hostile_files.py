@@ -283,7 +283,7 @@ def test_pickled_arrays_are_refused_and_never_run(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-# --- what is no file, and names that lead elsewhere ---------------------------------------------------
+# --- what is not a file, and names that lead elsewhere ---------------------------------------------------
 
 
 def test_pipes_devices_and_broken_links_are_refused_by_every_reader(tmp_path):
@@ -337,7 +337,7 @@ def test_a_database_with_a_query_in_the_place_of_a_table_is_refused(tmp_path):
         )
         database.commit()
     for path in (file, file.parent):
-        with pytest.raises(io.InputError, match=r"bag\.db3: 'messages' is no plain table"):
+        with pytest.raises(io.InputError, match=r"bag\.db3: 'messages' is not a plain table"):
             io.open_sweeps(path)
 
 

@@ -1,4 +1,4 @@
-"""Points, sweeps, images and JSON Lines: every layout, whole files only, errors that name the mend."""
+"""Points, sweeps, images and JSON Lines: every layout, whole files only, errors that name the fix."""
 
 import dataclasses
 import json
@@ -38,7 +38,7 @@ def test_empty_file_is_a_sweep_without_points(tmp_path, suffix):
 def test_binary_points_cut_short_are_refused_with_file_size_and_mend(tmp_path, size):
     (tmp_path / "a.bin").write_bytes(bytes(size))
     with pytest.raises(
-        io.InputError, match=rf"a\.bin: {size} bytes is no multiple of 16 .*Copy the file again"
+        io.InputError, match=rf"a\.bin: {size} bytes is not a multiple of 16 .*Copy the file again"
     ):
         io.read_points(tmp_path / "a.bin")
 

@@ -193,7 +193,7 @@ BAD = {
         PCD_HEADER.format(n=1, data="ascii").replace("x y z", "u y z") + "1 2 3\n",
         "no field x among u",
     ),
-    "text.pcd": ("this is no cloud", "no line DATA"),
+    "text.pcd": ("this is not a cloud", "no line DATA"),
     "odd.pcd": (
         PCD_HEADER.format(n=1, data="ascii").replace("TYPE F F F", "TYPE Q F F"),
         "header cannot be read",
@@ -210,7 +210,7 @@ BAD = {
     "no_z.ply": (PLY_HEADER.format(data="ascii", n=0, fields=PLY_XYZ[:34]), "no field z among x, y"),
     "list.ply": (
         PLY_HEADER.format(data="ascii", n=0, fields=f"{PLY_XYZ}property list uchar int i\n"),
-        "property i is no number",
+        "property i is not a number",
     ),
     "faces.ply": ("ply\nformat ascii 1.0\nelement face 1\nend_header\n", "write the vertices before"),
     "text.ply": ("no mesh", "no PLY file"),
@@ -466,7 +466,7 @@ def test_a_recording_cut_short_is_named_with_the_mend(tmp_path, name):
     RECORDINGS[name](tmp_path / name, ["/points"])
     data = (tmp_path / name).read_bytes()
     (tmp_path / name).write_bytes(data[: len(data) * 2 // 3])
-    with pytest.raises(io.InputError, match="mends a recording that was cut short"):
+    with pytest.raises(io.InputError, match="fixes a recording that was cut short"):
         list(io.open_sweeps(tmp_path / name))
 
 

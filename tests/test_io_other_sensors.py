@@ -1,4 +1,4 @@
-"""Argoverse 2, PandaSet and SemanticKITTI: frames, either order of sizes, errors that name the mend."""
+"""Argoverse 2, PandaSet and SemanticKITTI: frames, either order of sizes, errors that name the fix."""
 
 import json
 
@@ -131,7 +131,7 @@ def test_semantic_labels_of_another_sweep_or_cut_short_are_refused(tmp_path):
     with pytest.raises(io.InputError, match="2 labels for a sweep of 3 points"):
         semantic_kitti.read_semantic_labels(tmp_path / "a.label", num_points=3)
     (tmp_path / "a.label").write_bytes(bytes(6))
-    with pytest.raises(io.InputError, match="6 bytes is no multiple of 4"):
+    with pytest.raises(io.InputError, match="6 bytes is not a multiple of 4"):
         semantic_kitti.read_semantic_labels(tmp_path / "a.label")
 
 

@@ -1,4 +1,4 @@
-"""The paper's table: a rule that sees no result chooses the vehicle; a constant stands beside its errors."""
+"""The paper's table: a rule that sees no result chooses the vehicle; a constant stands next to its errors."""
 
 import importlib
 import pathlib

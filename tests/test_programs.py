@@ -1,4 +1,4 @@
-"""Kept programs: the bits of `detect`, read and not traced the second time, traced anew when broken."""
+"""Kept programs: the bits of `detect`, read and not traced the second time, traced again when broken."""
 
 import dataclasses
 import gc

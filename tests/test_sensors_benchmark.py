@@ -37,7 +37,7 @@ def detections(xy, scores, owner=()):
 
 
 def labelled_sweep(bench, xy, points_each=50):
-    """A sweep with cars at these places, each with so many points."""
+    """A sweep with cars at these places, each with that many points."""
     center = np.column_stack([xy, np.zeros(len(xy))])
     boxes = labelled_boxes(["Car"] * len(xy), center, np.tile(CAR_SIZE, (len(xy), 1)), np.zeros(len(xy)))
     xyz = np.repeat(center, points_each, axis=0).astype(np.float32)

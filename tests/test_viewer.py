@@ -128,7 +128,7 @@ def test_a_recording_is_read_on_and_only_from_its_start_to_go_back(folder):
     assert recording.passes == 2
     with pytest.raises(io.InputError, match="sweep 7: the recording ends before it"):
         frames.read(7)
-    assert frames.read(5).name == "000002", "after the end it begins anew"
+    assert frames.read(5).name == "000002", "after the end it begins again"
 
 
 # Scenes.

@@ -163,7 +163,7 @@ def test_a_box_partly_behind_the_camera_is_drawn_and_the_input_is_not_changed():
 def test_lidar_view_shows_left_boxes_on_the_left():
     left = viz.draw_lidar_view(np.zeros((0, 3)), boxes=one_box((15.0, 8.0, -1.0)))
     columns = np.argwhere((left == np.array(ESTIMATE)).all(axis=-1))[:, 1]
-    columns = columns[columns > 150]  # beside the legend
+    columns = columns[columns > 150]  # next to the legend
     assert len(columns) > 100
     assert columns.max() < left.shape[1] / 2
 

@@ -33,7 +33,7 @@ SENSOR_HEIGHT_M = 1.73
 """KITTI's, which Patchwork++ wants to know."""
 
 LENGTHS_M, WIDTHS_M, HEIGHTS_M = (1.5, 8.0), (0.4, 3.0), (0.6, 4.0)
-"""What is no vehicle by its measured size."""
+"""What is not a vehicle by its measured size."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,7 +17,7 @@ CELL_M = 1.0
 LEVELS = 6
 LOWEST_M = -3.0
 SPREAD = 2.0
-"""Points farther than the mean distance to their cell's centre and so many deviations are outliers."""
+"""Points farther than the mean distance to their cell's centre and that many deviations are outliers."""
 SAMPLES = 4096
 FIT_POINTS = 96
 """Points of a cluster that the angle search looks at."""

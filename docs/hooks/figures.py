@@ -48,7 +48,7 @@ def made_with(report: dict[str, Any]) -> str:
     at = report["circumstances"]
     device = at.get("device_kind", "cpu")
     machine = f"{at['processor']}, {at['cpus']} cores, jax {at['packages']['jax']}"
-    machine = machine if device == "cpu" else f"{device} beside {machine}"
+    machine = machine if device == "cpu" else f"{device} next to {machine}"
     return f"\n\n*Recorded at commit {at['commit'][:8]}, {machine}.*"
 
 
@@ -73,7 +73,7 @@ def ap(values: dict[str, float], names: Sequence[str]) -> list[float]:
 
 
 def sizes() -> str:
-    """Size errors beside the constant row's."""
+    """Size errors next to the constant row's."""
     report = load("accuracy_default")["copies"]["as recorded"]
     names = ["mae", "rmse", "percent", "pearson", "mean_iou"]
     rows = [(kind, *(values[n] for n in names)) for kind, values in report["sizes"].items()]
@@ -82,7 +82,7 @@ def sizes() -> str:
 
 
 def paper_table() -> str:
-    """The paper's table, beside its own figures."""
+    """The paper's table, next to its own figures."""
     report = load("paper_table")
     rows = []
     for preset in ("default", "paper"):
@@ -341,7 +341,7 @@ def status() -> str:
     """Every bit and its sentence."""
     bits = [bit for bit in Status if bit.value]
     rows = [(f"`{bit.name}`", bit.value, bit.describe()[0].partition(": ")[2]) for bit in bits]
-    return table(["bit", "value", "what happened, and the mend"], rows)
+    return table(["bit", "value", "what happened, and the fix"], rows)
 
 
 def counts() -> str:

@@ -472,7 +472,7 @@ def view(
     """Show sweeps and boxes in the browser, and move thresholds live (the view extra).
 
     A page with the points, boxes, hulls and labels in 3D, the camera's image, a timeline, and sliders that
-    detect anew without compiling. "copy settings" gives the TOML for `detect --config`.
+    detect again without compiling. "copy settings" gives the TOML for `detect --config`.
     """
     with input_errors():
         options = ViewOptions(

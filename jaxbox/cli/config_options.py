@@ -30,7 +30,7 @@ def chosen_config(
       The settings.
 
     Raises:
-      InputError: for an unknown preset or setting, a value that does not fit, a file that is no such file,
+      InputError: for an unknown preset or setting, a value that does not fit, a file that is not such a file,
         or settings that contradict each other.
     """
     try:

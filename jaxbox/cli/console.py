@@ -18,11 +18,11 @@ from jaxbox.io import InputError
 from jaxbox.run.cache import CacheWarning
 
 FILE_WIDTH = 120
-"""Columns of a table where stdout is no terminal: wide enough for all of them."""
+"""Columns of a table where stdout is not a terminal: wide enough for all of them."""
 
 
 class OutputError(Exception):
-    """Results cannot be written, so that a run cannot go on; the message names the file and the mend."""
+    """Results cannot be written, so that a run cannot go on; the message names the file and the fix."""
 
 
 class ExitCode(enum.IntEnum):
@@ -61,7 +61,7 @@ def cache_warnings() -> Iterator[None]:
 
 @contextlib.contextmanager
 def input_errors() -> Iterator[None]:
-    """Turns errors that the user can mend into one line on stderr and exit code 2.
+    """Turns errors that the user can fix into one line on stderr and exit code 2.
 
     Raises:
       typer.Exit: in place of a bad input, an unwritable folder or a missing extra.
@@ -119,7 +119,7 @@ def undisturbed() -> Iterator[None]:
 
 
 def make_progress(*, shown: bool) -> Progress:
-    """A progress bar with rate and time left, on stderr; it hides where stderr is no terminal."""
+    """A progress bar with rate and time left, on stderr; it hides where stderr is not a terminal."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),

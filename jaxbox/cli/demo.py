@@ -22,7 +22,7 @@ FOUND_IOU = 0.5
 
 
 def run_demo(output: pathlib.Path, *, seed: int, console: Console) -> None:
-    """Makes a sweep, detects, prints the boxes beside the truth and writes the pictures.
+    """Makes a sweep, detects, prints the boxes next to the truth and writes the pictures.
 
     Args:
       output: folder for the pictures.
@@ -103,7 +103,7 @@ def compare_with_truth(boxes: BoxSet, sweep: SyntheticSweep) -> Table:
 
 def _errors(boxes: BoxSet, estimate: int, sweep: SyntheticSweep, row: int) -> list[str]:
     size = boxes.size[estimate] - sweep.boxes.size[row]
-    # An axis has no front: half a turn is no error.
+    # An axis has no front: half a turn is not an error.
     turn = np.degrees(boxes.yaw[estimate] - sweep.boxes.yaw[row])
     turn = (turn + 90) % 180 - 90
     return [boxes.captions[estimate], *(f"{error:+.2f}" for error in size), f"{turn:+.1f}"]

@@ -134,7 +134,7 @@ def _prepare(paths: Sequence[str], options: DetectOptions) -> tuple[Sequence[io.
     )
     if options.resume:
         account.check_resumable()
-    # Measured anew where the archive has grown, the sensor would stand otherwise than for what is there.
+    # Measured again where the archive has grown, the sensor would stand otherwise than for what is there.
     earlier = account.earlier_mounting() if options.resume and options.level else None
     sweeps, mounting = seen_from_sensor(
         sweeps, sensor_at=options.sensor_at, level=options.level, measured=earlier
@@ -184,7 +184,7 @@ def _missing(
 def _frames(
     sweeps: Iterator[io.Sweep], options: DetectOptions, run: RunReport, results: Results
 ) -> FrameSource:
-    """The frames of the sweeps, made here or by so many processes."""
+    """The frames of the sweeps, made here or by that many processes."""
     work = FrameWork(
         config=options.config,
         capacity=options.capacity,

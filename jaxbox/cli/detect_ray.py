@@ -116,7 +116,7 @@ def _tell(part: PartitionReport, options: RayOptions, speaks: bool) -> None:
     """One partition: what went wrong to stderr, and what was done to stdout."""
     if part.num_deaths:
         workers = "a worker" if part.num_deaths == 1 else f"{part.num_deaths} workers"
-        print_error(f"{part.name}: {workers} died on it; it was begun anew.")
+        print_error(f"{part.name}: {workers} died on it; it was begun again.")
     for failure in part.failures:
         print_error(f"sweep {failure['sweep']}: {failure['reason']}")
     if part.error is not None:

@@ -85,7 +85,7 @@ def run_eval(
 
 
 def print_report(report: Mapping[str, Any], console: Console) -> None:
-    """Prints what `evaluate_folders` measured: rates, sizes beside the constant, average precision."""
+    """Prints what `evaluate_folders` measured: rates, sizes next to the constant, average precision."""
     taken = report.get("num_missing_results", 0)
     console.print(f"{report['num_frames']} labelled sweeps" + f", {taken} without results" * bool(taken))
     console.print(recall_table(report["selections"]))

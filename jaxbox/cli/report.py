@@ -11,7 +11,7 @@ from jaxbox.run.summary import classes_in_words
 from jaxbox.types import Detections, Status
 
 SHOWN_MIN_SCORE = DEFAULT_SCORE_THRESHOLD
-"""Boxes that score less are written but not drawn or counted as found: most of them are no vehicle."""
+"""Boxes that score less are written but not drawn or counted as found: most of them are not vehicles."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -104,7 +104,7 @@ def count_classes(detections: Detections, *, min_score: float) -> str:
 
 
 def describe_run(run: RunReport) -> list[str]:
-    """The summary: sweeps, times with compiling apart, and which status bits occurred how often.
+    """The summary: sweeps, times without compiling, and which status bits occurred how often.
 
     Args:
       run: what happened.

@@ -26,9 +26,9 @@ from jaxbox.run.versions import versions
 from jaxbox.types import Calibration, Detections
 
 CONFIG_NAME = "config.toml"
-"""The exact settings, beside the results."""
+"""The exact settings, next to the results."""
 RUN_NAME = "run.json"
-"""Versions, options, how the sensor stands, and outcome, beside the results."""
+"""Versions, options, how the sensor stands, and outcome, next to the results."""
 _TRANSFORM_DECIMALS = 6
 
 
@@ -66,7 +66,7 @@ def written(path: pathlib.Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise OutputError(
-            f"{path}: cannot be written ({error.strerror or error}). Free space or mend the permissions, and "
+            f"{path}: cannot be written ({error.strerror or error}). Free space or fix the permissions, and "
             "run the same command with --resume; or choose another --output."
         ) from error
 
@@ -175,7 +175,7 @@ class Results:
 
 @dataclasses.dataclass
 class RunAccount:
-    """The account of a run, beside its results: `CONFIG_NAME` and `RUN_NAME`."""
+    """The account of a run, next to its results: `CONFIG_NAME` and `RUN_NAME`."""
 
     output: pathlib.Path
     """Folder of the results."""

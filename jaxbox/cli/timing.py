@@ -26,7 +26,7 @@ class TimedDetector:
         return self._run(cloud)
 
     def _compile(self, capacity: int) -> float:
-        """Seconds of a first call on an empty sweep; a second one is taken off, as it is no compiling."""
+        """Seconds of a first call on an empty sweep; a second one is taken off, as it is not compiling."""
         start = time.perf_counter()
         empty = PointCloud.from_numpy(np.zeros((0, 3), np.float32), capacity=capacity)
         with giving_memory_back():

@@ -193,7 +193,7 @@ def write_trials(path: pathlib.Path, bench: Bench, axes: Sequence[Axis], trials:
 
 
 def write_report(report: dict[str, Any], options: TuneOptions, console: Console) -> None:
-    """Prints the report and writes it as JSON and Markdown, with the best settings beside it."""
+    """Prints the report and writes it as JSON and Markdown, with the best settings next to it."""
     notes = run_notes(report)
     for name, columns, rows in tuning.report_tables(report):
         console.print(make_table(name, columns, rows))

@@ -28,9 +28,9 @@ from jaxbox.run.cache import CacheFolders
 from jaxbox.run.versions import versions
 
 MANIFEST = "manifest.json"
-"""The account of a run, beside its partitions."""
+"""The account of a run, next to its partitions."""
 CONFIG = "config.toml"
-"""The exact settings, beside its partitions."""
+"""The exact settings, next to its partitions."""
 SWEEPS_PER_PARTITION = 256
 """Some 10 s of work, which is what a worker that dies costs, in files that are worth opening."""
 _LOOKERS = 16
@@ -64,7 +64,7 @@ def detect_dataset(
     The sweeps are cut into partitions in their order. Each is one Parquet file, ``part-000000.parquet``,
     with the columns of `jaxbox.io.parquet` and the boxes of `jaxbox.detect`, bit for bit. A partition's
     file is there whole or not at all, so that whoever dies costs time and nothing else: Ray starts a
-    dead worker anew and gives the partition out again. ``manifest.json`` tells what became of every sweep.
+    dead worker again and hands its partition out again. ``manifest.json`` tells what became of every sweep.
 
     Args:
       sources: local paths as `jaxbox.io.open_sweeps` takes them (on a cluster, on a disk that all nodes
@@ -287,7 +287,7 @@ class _Run:
             report = PartitionReport.from_json(metadata[REPORT_KEY.encode()])
         except (arrow.ArrowException, KeyError, ValueError):
             return None
-        # A sweep that failed may have been mended since; then all of its partition is done again.
+        # A sweep that failed may have been fixed since; then all of its partition is done again.
         return report if report.key == partition.key and not report.failures else None
 
     def _results(self, partitions: list[Partition], workers: int) -> Generator[PartitionReport, None, None]:

@@ -13,7 +13,7 @@ class PartitionReport:
     name: str
     """Of its file, without the suffix."""
     key: str
-    """Digest of its sweeps, and of settings and options: a file of another key is no result of this run."""
+    """Digest of its sweeps, and of settings and options: a file of another key is no result of it."""
     num_sweeps: int
     """Sweeps that belong to it."""
     num_boxes: int = 0
@@ -25,7 +25,7 @@ class PartitionReport:
     failures: list[dict[str, str]] = dataclasses.field(default_factory=list)
     """Sweeps that are not: ``sweep``, ``url`` and ``reason``."""
     num_deaths: int = 0
-    """Workers that died while they worked on it; it was begun anew each time."""
+    """Workers that died while they worked on it; it was begun again each time."""
     worker: str = ""
     """Node and process that finished it."""
     seconds: float = 0.0

@@ -83,7 +83,7 @@ def list_sweeps(sources: Sequence[str], topic: str | None, tasks: Tasks) -> list
             raise io.InputError(
                 f"{source}: no points there; recordings have to be on a local or mounted disk."
             )
-        # As in a local folder: all of one format, because text may be the calibration beside the points.
+        # As in a local folder: all of one format, because text may be the calibration next to the points.
         first = min(number for number, _ in found)
         refs += [_named(url) for number, url in sorted(found) if number == first]
     return _distinct(refs) if remote else refs
@@ -102,7 +102,7 @@ def _list_local(paths: list[str], topic: str | None) -> list[SweepRef]:
 
 
 def _units(source: str) -> list[str]:
-    """A URL as URLs of files and folders that can be listed apart."""
+    """A URL as URLs of files and folders that can be listed separately."""
     system, path = _open_system(source)
     if "*" in path or "?" in path:
         return [_url_of(source, system, found) for found in system.glob(path)]
@@ -262,7 +262,7 @@ def _read_file(path: pathlib.Path) -> ReadSweep:
 
 
 def _companion(path: pathlib.Path) -> tuple[int, str] | None:
-    """A file that tells of points or time of all beside this: how many folders up, and its name there."""
+    """A file about the points or times of all files next to this: how many folders up, and its name there."""
     match path.parent.parent.name, path.parent.name:
         case "sensors", "lidar":
             return 3, "calibration/egovehicle_SE3_sensor.feather"

@@ -39,7 +39,7 @@ REPORT_KEY = "jaxbox.partition"
 """Key of a partition's metadata that holds its report."""
 _ATTEMPT = ".attempt.json"
 MAX_DEATHS = 2
-"""A sweep on which so many workers died, each with that sweep alone, is given up."""
+"""A sweep on which that many workers died, each with that sweep alone, is given up."""
 _READERS = 4
 """Threads that read: fetching waits for the network, and readers let go of Python's lock."""
 _DECISIVE = ("jaxbox", "jax", "jaxlib")
@@ -88,7 +88,7 @@ class Task:
 
 
 class Attempt:
-    """The memory of a partition's earlier attempts, in a small file beside it while it is at work.
+    """The memory of a partition's earlier attempts, in a small file next to it while it is at work.
 
     The first attempt goes in batches. Once a worker has died, the next goes sweep by sweep and notes each
     before it begins, so that one that always kills its worker is known, and given up.

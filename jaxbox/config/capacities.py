@@ -149,8 +149,7 @@ CAPACITIES = (
         field="hull.max_vertices",
         count="hull_vertices",
         status="HULL_OVERFLOW",
-        overflow="a hull has more vertices than hull.max_vertices, and every so many were kept, evenly round "
-        "it",
+        overflow="a hull has more vertices than hull.max_vertices, and every n-th was kept, evenly round it",
     ),
 )
 """Every capacity of the configuration, in the order of the stages."""

@@ -37,17 +37,17 @@ class ClassPrior:
     height_above_m: Scalar
     """Width of the height score above the prior."""
     min_height_m: Scalar
-    """Lower tops, after the range allowance, are no such vehicle."""
+    """Lower tops, after the range allowance, are not such a vehicle."""
     max_height_m: Scalar
-    """Higher tops are no such vehicle."""
+    """Higher tops are not such a vehicle."""
     max_length_m: Scalar
-    """Longer measured extents are no such vehicle."""
+    """Longer measured extents are not such a vehicle."""
     max_width_m: Scalar
-    """Wider measured extents are no such vehicle."""
+    """Wider measured extents are not such a vehicle."""
     min_box_height_m: Scalar
     """Boxes are at least so high: their tops read low."""
     prior_weight: Scalar
-    """Factor of the score: how common the class is beside the car, softened."""
+    """Factor of the score: how common the class is relative to the car, softened."""
     count_max_height_m: Scalar
     """Points lower than this above the ground belong to the vehicle; higher ones within the box
     speak against it."""

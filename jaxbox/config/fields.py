@@ -1,7 +1,7 @@
 """Fields by dotted name, such as ``vehicles.ring_weight`` or ``clustering.maps.0.min_height_m``.
 
 A name is the path through `DetectorConfig`; a number picks an item of a tuple. A traced field is a
-threshold that compiled code takes as an operand; a static one decides a shape and compiles anew.
+threshold that compiled code takes as an operand; a static one decides a shape and compiles again.
 
 The same names are the keys of a settings file: tables are the stages, an array of tables is a tuple, and a
 dotted key reaches one value. `config_to_toml` writes such a text, `config_from_toml` reads it.
@@ -132,7 +132,7 @@ def config_from_toml(text: str, *, base: DetectorConfig | None = None) -> Detect
       The settings.
 
     Raises:
-      ValueError: with the line where it is no TOML, or with the setting, as `replace_fields`.
+      ValueError: with the line where it is not TOML, or with the setting, as `replace_fields`.
 
     >>> config_from_toml("vehicles.max_overlap = 0.2").vehicles.max_overlap
     0.2
@@ -248,7 +248,7 @@ def _resized(config: DetectorConfig, name: str, length: int) -> DetectorConfig:
         items = getattr(items, step, None)
     if not isinstance(items, tuple) or not items:
         lists = dict.fromkeys(leaf.partition(".0.")[0] for leaf, _ in _leaves(config) if ".0." in leaf)
-        raise ValueError(f"{name} is no list; nearest lists are {nearest_fields(name, lists)}.")
+        raise ValueError(f"{name} is not a list; nearest lists are {nearest_fields(name, lists)}.")
     # Another class would have no defaults to begin with: there are as many as labels.
     is_open = all(field.default is not dataclasses.MISSING for field in dataclasses.fields(items[0]))
     if length < 1 or (length != len(items) and not is_open):
@@ -349,7 +349,7 @@ def check_traced(config: DetectorConfig, name: str) -> None:
     nearest = nearest_fields(name, traced_fields(config))
     if name in leaves:
         raise ValueError(
-            f"{name} is static: each value would compile the detector anew. "
+            f"{name} is static: each value would compile the detector again. "
             f"Nearest traced settings: {nearest}."
         )
     raise ValueError(f"there is no setting {name}; nearest traced settings: {nearest}.")
@@ -409,7 +409,7 @@ def _checked_value(name: str, leaf: _Leaf, value: Any) -> Any:
             else " or ".join(sorted(_TYPE_NAMES.get(t, t.__name__) for t in allowed))
         )
         raise ValueError(f"{name} is {value!r}; it must be {wanted}.")
-    # An int in the place of a threshold would be another type to the compiler, which then starts anew.
+    # An int in the place of a threshold would be another type to the compiler, which then starts again.
     return float(value) if float in allowed else value
 
 

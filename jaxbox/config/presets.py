@@ -69,7 +69,7 @@ class DetectorConfig:
 
     @classmethod
     def presets(cls, *, num_beams: int = 64) -> dict[str, "DetectorConfig"]:
-        """The named presets that the command line offers, for a sensor of so many beams."""
+        """The named presets that the command line offers, for a sensor of that many beams."""
         presets = {"default": cls(), "fast": cls.fast(), "paper": cls.paper()}
         return {name: cls.for_sensor(num_beams, base=preset) for name, preset in presets.items()}
 

@@ -1,6 +1,6 @@
 """The detector's configuration: one sub-config a stage.
 
-A field marked static decides a shape or a loop bound: changing it compiles anew. Every other field
+A field marked static decides a shape or a loop bound: changing it compiles again. Every other field
 is compared with data and is traced: a sweep over thresholds is a `jax.vmap` and compiles once.
 Lengths are metres, angles degrees (``_deg``), everything else unitless unless said.
 """
@@ -88,9 +88,9 @@ class GroundConfig:
     tolerance_m: Scalar = 0.1
     """A candidate within this of a plane is an inlier."""
     max_slope_deg: Scalar = 12.0
-    """Steeper planes are no ground."""
+    """Steeper planes are not ground."""
     min_inlier_fraction: Scalar = 0.1
-    """A plane with a smaller share of the candidates is no ground."""
+    """A plane with a smaller share of the candidates is not ground."""
     surface: bool = _static(default=True)
     """static: refine the plane by the ground grid; False stops at the planes (the paper)."""
     surface_cell_m: float = _static(default=0.5)
@@ -102,11 +102,11 @@ class GroundConfig:
     max_grade: Scalar = 0.07
     """Steepest rise of the ground relative to the plane, m/m."""
     band_below_m: Scalar = 0.3
-    """Points lower than the plane by more than this, at the sensor, are no ground."""
+    """Points lower than the plane by more than this, at the sensor, are not ground."""
     band_below_grade: Scalar = 0.02
     """Growth of that band with range, m/m."""
     band_above_m: Scalar = 0.3
-    """Points higher than the plane by more than this, at the sensor, are no ground."""
+    """Points higher than the plane by more than this, at the sensor, are not ground."""
     band_above_grade: Scalar = 0.06
     """Growth of that band with range, m/m."""
     blind_radius_m: Scalar = 2.5
@@ -273,11 +273,11 @@ class CompletionConfig:
     free_length_weight: Scalar = 2.0
     """Cost of the fraction of the box's area seen to be free."""
     inside_weight: Scalar = 1.0
-    """Worth of the fraction of fitted points inside the box."""
+    """Weight of the fraction of fitted points inside the box."""
     near_weight: Scalar = 0.5
-    """Worth of the mean closeness of fitted points to the visible faces."""
+    """Weight of the mean closeness of fitted points to the visible faces."""
     closeness_weight: Scalar = 1.0
-    """Worth of the rectangle criterion."""
+    """Weight of the rectangle criterion."""
     not_away_cost: Scalar = 0.02
     """Cost of a width that does not extend away from the sensor."""
 
@@ -308,19 +308,19 @@ class VehicleConfig:
     ring_m: Scalar = 0.5
     """A point farther outside than the margin but nearer than this speaks against the box."""
     top_quantile: Scalar = 0.01
-    """Share of the points in a box that may lie above its top: a single return in the air is no roof."""
+    """Share of the points in a box that may lie above its top: a single return in the air is not a roof."""
     top_margin_m: Scalar = 0.03
     """Added to the top of the points: beams seldom meet the very top."""
     top_grade: Scalar = 0.0075
     """A top may be higher than that of its points by this times the range: the beams' spacing."""
     min_extent_m: Scalar = 1.0
-    """Boxes with no measured extent as long as this, and clusters with such a diagonal, are no vehicle."""
+    """Boxes with no measured extent as long as this, and clusters with such a diagonal, are not vehicles."""
     saturation_points: Scalar = 100.0
-    """Clusters with at least so many points lose no score for sparseness."""
+    """Clusters with at least that many points lose no score for sparseness."""
     sparseness_power: Scalar = 0.3
     """score x min(1, points / saturation)^power."""
     free_scale: Scalar = 0.15
-    """score x exp(-(free length of the rays inside / scale)^2), beside x the fraction of rays that hit."""
+    """score x exp(-(free length of the rays inside / scale)^2), besides x the fraction of rays that hit."""
     ring_weight: Scalar = 8.0
     """score x exp(-weight x ring points / points)."""
     overhead_weight: Scalar = 6.0
@@ -328,9 +328,9 @@ class VehicleConfig:
     upper_height_m: Scalar = 0.9
     """Points higher than this are glass, bonnet and roof; see ``ClassPrior.recess_m``."""
     recess_share: Scalar = 0.4
-    """Full worth from this share of the upper points behind the faces on."""
+    """Share of the upper points behind the faces from which the score is full."""
     upright_score: Scalar = 0.2
-    """Worth of a box whose upper points are all on its faces: score x a factor from this to 1."""
+    """score x a factor from this, where all upper points are on the faces, to 1."""
     support_points: Scalar = 10.0
     """score x min(1, ground points round the box / this)."""
     objective_gate: Scalar = 2.4

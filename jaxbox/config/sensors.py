@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 
 TUNED_BEAMS = 64
-"""The presets were chosen on a sensor of so many beams, KITTI's HDL-64E."""
+"""The presets were chosen on a sensor of that many beams, KITTI's HDL-64E."""
 TUNED_SPACING_DEG = 0.37
 """Mean step in elevation between that sensor's beams from -10 to 0 degrees, which meet the vehicles."""
 
@@ -23,7 +23,7 @@ class SensorChanges:
     changes: Mapping[str, Mapping[str, float]]
     """Values by stage and field."""
     cells: float = 1.0
-    """Occupied cells beside those of 64 beams: the capacity of each map is multiplied by it."""
+    """Occupied cells relative to those of 64 beams: the capacity of each map is multiplied by it."""
 
 
 SENSORS: Mapping[int, SensorChanges] = {
@@ -65,7 +65,9 @@ def sensor_changes(num_beams: int) -> SensorChanges:
       ValueError: for another number.
     """
     if num_beams not in SENSORS:
-        raise ValueError(f"{num_beams}: there are no settings for so many beams; choose one of {_choices()}.")
+        raise ValueError(
+            f"{num_beams}: there are no settings for that many beams; choose one of {_choices()}."
+        )
     return SENSORS[num_beams]
 
 

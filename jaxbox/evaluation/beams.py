@@ -11,7 +11,7 @@ _MIN_BACK_RAD = np.pi
 """The azimuth of a beam falls back by nearly a turn; by less where the sensor's noise turns it back."""
 _LARGE_STEP_RAD = 0.5
 _MAX_LARGE_SHARE = 0.05
-"""Of the steps in azimuth so many may be so large: where the view is blocked."""
+"""Of the steps in azimuth that many may be so large: where the view is blocked."""
 _MAX_MISSING = 0.1
 """Beams of a sensor that may leave no trace in a sweep, as a share."""
 
@@ -45,7 +45,7 @@ def beam_of_points(xyz: np.ndarray) -> np.ndarray:
 
 
 def goes_beam_by_beam(xyz: np.ndarray) -> bool:
-    """Whether the points of a sweep can be in the order of beams: each beside the one before.
+    """Whether the points of a sweep can be in the order of beams: each next to the one before.
 
     Args:
       xyz: (n, 3) m, sensor frame.

@@ -2,7 +2,7 @@
 
 Few labelled frames make a noisy figure: one borderline car is some points of average precision, and turning
 the input by a few degrees moves it as much. Turned and mirrored copies are as good sweeps as the recorded
-one, so a difference between two settings is judged by their mean beside their spread.
+one, so a difference between two settings is judged by their mean next to their spread.
 """
 
 import dataclasses

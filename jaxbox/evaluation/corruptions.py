@@ -35,7 +35,7 @@ SWEEP_PERIOD_S = 0.1
 
 
 def thin_beams(xyz: np.ndarray, intensity: np.ndarray, one_in: float, rng: np.random.Generator) -> Points:
-    """Keeps every so many-th beam, as a sensor with fewer beams over the same angles would have them.
+    """Keeps every n-th beam, as a sensor with fewer beams over the same angles would have them.
 
     Args:
       xyz: (n, 3) m, beam by beam, see `jaxbox.evaluation.beams.beam_of_points`.

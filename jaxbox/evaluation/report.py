@@ -18,7 +18,7 @@ SELECTIONS: Mapping[str, matching.Selection] = {
     "clear": matching.Selection(min_points=30, max_occlusion=1),
     "dense": matching.Selection(min_points=50),
 }
-"""Cars: every label; those of KITTI's difficulties; those that a sweep shows well; and those of so many
+"""Cars: every label; those of KITTI's difficulties; those that a sweep shows well; and those of that many
 points that no box should have its length and width changed places."""
 
 MATCH_OVERLAP = 0.2
@@ -65,7 +65,7 @@ def read_folders(
         (sweep, objects) for sweep in open_sweeps(root) if (objects := sweep.read_labels()) is not None
     ]
     if not labelled:
-        raise InputError(f"{root}: no sweep there has labels; expected label_2 or label_02 beside velodyne.")
+        raise InputError(f"{root}: no sweep there has labels; expected label_2 or label_02 next to velodyne.")
     labels = {sweep.name: objects for sweep, objects in labelled}
     detections = _read_results(pathlib.Path(results), list(labels), missing_as_empty=missing_as_empty)
     return LabelledResults(
@@ -122,7 +122,7 @@ def _read_results(
     """Results of each frame; None where the file is missing."""
     if not folder.is_dir():
         raise InputError(f"{folder}: there is no such folder; give the one that `jaxbox detect` wrote to.")
-    # The official layout: results under data/, beside statistics that are text files too.
+    # The official layout: results under data/, next to statistics that are text files too.
     if not any((folder / f"{name}.txt").is_file() for name in names) and (folder / "data").is_dir():
         folder = folder / "data"
     files = {name: folder / f"{name}.txt" for name in names}

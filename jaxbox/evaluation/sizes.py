@@ -1,7 +1,7 @@
 """Errors of estimated dimensions and directions of matched boxes (paper, section 4.6).
 
 Most cars are of nearly one size, so always answering the median car does well in every one of these
-measures: a table of size errors means something only beside that constant's, `constant_sizes`.
+measures: a table of size errors means something only next to that constant's, `constant_sizes`.
 """
 
 import dataclasses

@@ -83,7 +83,7 @@ def read_feather(path: str | os.PathLike[str]) -> Points:
       As `jaxbox.io.read_points`.
 
     Raises:
-      InputError: where it is no such table.
+      InputError: where it is not such a table.
       ImportError: without the extra ``arrow``.
     """
     xyz, intensity = named_points(_read_table(path, ("x", "y", "z", "intensity")), str(path))
@@ -152,7 +152,7 @@ def read_argoverse2_boxes(
       The boxes, in the file's order.
 
     Raises:
-      InputError: naming file and entry, where it is no such list, or a field is missing or no number.
+      InputError: naming file and entry, where it is not such a list, or a field is missing or no number.
     """
     entries = _read_records(path)
     named = [(entry, f"{path}, entry {index}") for index, entry in enumerate(entries)]

@@ -41,13 +41,13 @@ def read_preset(path: str | os.PathLike[str]) -> str:
     """Reads which preset a settings file changes.
 
     Args:
-      path: as `read_config`, which refuses a name that is no preset's.
+      path: as `read_config`, which refuses a name that is not a preset's.
 
     Returns:
       What it names under ``preset``, or "default".
 
     Raises:
-      InputError: naming the file, where it is no settings file.
+      InputError: naming the file, where it is not a settings file.
     """
     return _parse(path).get(PRESET_KEY, "default")
 
@@ -74,7 +74,7 @@ def _parse(path: str | os.PathLike[str]) -> dict[str, Any]:
     # Tables within tables without end.
     except (ValueError, RecursionError) as error:
         raise InputError(
-            f"{path}: no {kind} ({reason(error)}); mend the line, or name the file by its kind."
+            f"{path}: no {kind} ({reason(error)}); fix the line, or name the file by its kind."
         ) from error
     if not isinstance(tables, dict):
         raise InputError(f'{path}: it must be one object of values by name: {{"box.criterion": "area"}}.')

@@ -15,7 +15,7 @@ def read_drives(path: str | os.PathLike[str], names: Iterable[str]) -> dict[str,
     Frames of one drive show the same street and often the same cars, so figures are pooled by drive.
 
     Args:
-      path: text, one frame and its drive a line, apart by spaces; empty lines and what follows a "#" are
+      path: text, one frame and its drive a line, separated by spaces; empty lines and what follows a "#" are
         skipped. Frames beyond those asked for are allowed.
       names: the frames to look up.
 

@@ -82,7 +82,7 @@ def read_jsonl(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
       One record a line; empty lines are skipped.
 
     Raises:
-      InputError: naming file and line, where a line is no JSON object.
+      InputError: naming file and line, where a line is not a JSON object.
     """
     lines = enumerate(read_text(path, max_bytes=None).splitlines(), start=1)
     return [_parse_line(line, f"{path}, line {number}") for number, line in lines if line.strip()]
@@ -130,7 +130,7 @@ def finished_jsonl(path: pathlib.Path) -> frozenset[str]:
       The names.
 
     Raises:
-      InputError: where it is no such file.
+      InputError: where it is not such a file.
     """
     return (
         frozenset(str(record.get("name")) for record in read_jsonl(path)) if path.is_file() else frozenset()

@@ -34,7 +34,7 @@ VEHICLE_TYPES = tuple(label.word.capitalize() for label in Label)
 """Types of the objects that the detector looks for."""
 
 MIN_VISIBLE_FRACTION = 0.3
-"""Boxes with less of their 2D box in the image are no answer: the labels hold what the image shows."""
+"""Boxes with less of their 2D box in the image are not answers: the labels hold what the image shows."""
 
 _project_boxes = jax.jit(project_boxes)
 
@@ -265,7 +265,7 @@ def objects_from_boxes(
       yaw: (n,) rad.
       calibration: the camera whose image the 2D boxes are in.
       types: n class names.
-      min_visible_fraction: boxes with a smaller part of their 2D box in the image are no label.
+      min_visible_fraction: boxes with a smaller part of their 2D box in the image are not labels.
 
     Returns:
       n objects, with the part out of the image as truncation and occlusion 0; None for no label.
@@ -345,7 +345,7 @@ def boxes_from_objects(
 
 
 def _wrap_yaw(yaw: np.ndarray) -> np.ndarray:
-    """`jaxbox.geometry.planar.wrap_yaw` in NumPy: under JAX every new number of labels would compile anew."""
+    """`jaxbox.geometry.planar.wrap_yaw` in NumPy: JAX would compile again for every number of labels."""
     wrapped = yaw - np.pi * np.floor(yaw / np.pi + 0.5)
     return np.where(wrapped >= np.pi / 2, -np.pi / 2, wrapped)
 

@@ -43,7 +43,7 @@ def read_calibration(
 
     Raises:
       InputError: naming file and key, where one is missing, has a wrong number of values or a value
-        that is no finite number, or a matrix is singular.
+        that is not a finite number, or a matrix is singular.
     """
     entries = _read_entries(path)
     rectification = _matrix(entries, ("R0_rect", "R_rect"), (3, 3), path)
@@ -59,7 +59,7 @@ def write_calibration(
 
     Args:
       path: the file; its folder is made where it is missing.
-      calibration: its T_rect_velo is written as Tr_velo_to_cam, beside the identity as rectification.
+      calibration: its T_rect_velo is written as Tr_velo_to_cam, next to the identity as rectification.
       camera: 0 to 3.
     """
     rows = {

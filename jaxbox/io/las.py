@@ -47,7 +47,7 @@ def read_las(path: str | os.PathLike[str]) -> Points:
       As `jaxbox.io.read_points`.
 
     Raises:
-      InputError: where it is no such file, is cut short, or holds map coordinates.
+      InputError: where it is not such a file, is cut short, or holds map coordinates.
       ImportError: without the extra ``las``.
     """
     laspy = require("laspy", extra="las", what="LAS and LAZ files")
@@ -64,14 +64,14 @@ def read_las(path: str | os.PathLike[str]) -> Points:
             else:
                 _check_layers(pathlib.Path(path), header, size)
             points = reader.read()
-        # A scale that is no number makes points that are none, which the detector counts.
+        # A scale that is not a number makes points that are none, which the detector counts.
         with np.errstate(all="ignore"):
             columns = {name: np.asarray(getattr(points, name)) for name in ("x", "y", "z", "intensity")}
     except InputError:
         raise
     # laspy and its decoders raise whatever the bytes lead them to; lazrs even its own Rust errors.
     except BaseException as error:
-        # A panic in Rust is no Exception.
+        # A panic in Rust is not an Exception.
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
         raise InputError(f"{path}: no readable LAS or LAZ file ({reason(error)}); copy it again.") from error

@@ -91,7 +91,7 @@ def measure_sweeps(
     Raises:
       InputError: where none of them can be read and shows a ground, or it lies above the sensor.
     """
-    # Every so many: a recording is passed once.
+    # Every n-th sweep: a recording is passed once.
     some = sweeps[:: -(-len(sweeps) // NUM_MEASURED)]
     found = [_measured(sweep, position) for sweep in some]
     seen = [mounting for mounting in found if mounting is not None]

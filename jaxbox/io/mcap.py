@@ -30,7 +30,7 @@ def open_mcap(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
       The sweeps, with the time at which each was recorded.
 
     Raises:
-      InputError: where it is no such file, or the topic has to be named.
+      InputError: where it is not such a file, or the topic has to be named.
       ImportError: without the extra ``mcap``.
     """
     counts: dict[str, int] = {}

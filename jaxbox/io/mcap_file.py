@@ -42,7 +42,7 @@ def open_mcap_file(path: pathlib.Path) -> Iterator["McapFile"]:
         raise
     except Exception as error:
         raise InputError(
-            f"{path}: the MCAP file cannot be read ({reason(error)}). Copy it again; `mcap recover` mends a "
+            f"{path}: the MCAP file cannot be read ({reason(error)}). Copy it again; `mcap recover` fixes a "
             "recording that was cut short."
         ) from error
 

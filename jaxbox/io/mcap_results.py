@@ -123,7 +123,7 @@ def finished_mcap(path: pathlib.Path) -> frozenset[str]:
       The names, also of sweeps without boxes.
 
     Raises:
-      InputError: where it is no such file.
+      InputError: where it is not such a file.
       ImportError: without the extra ``mcap``.
     """
     if not path.is_file():

@@ -37,7 +37,7 @@ def read_npy(path: str | os.PathLike[str]) -> Points:
       As `jaxbox.io.read_points`.
 
     Raises:
-      InputError: where it is no such array, or is cut short.
+      InputError: where it is not such an array, or is cut short.
     """
     check_file(path)
     try:
@@ -75,7 +75,7 @@ def read_npz(path: str | os.PathLike[str]) -> Points:
       As `jaxbox.io.read_points`.
 
     Raises:
-      InputError: where it is no such file, or holds no such array.
+      InputError: where it is not such a file, or holds no such array.
     """
     check_file(path)
     try:
@@ -93,7 +93,7 @@ def read_npz(path: str | os.PathLike[str]) -> Points:
             found = {name: arrays[name] for name in names}
     except InputError:
         raise
-    # A file of another kind is no archive, which shows as the lack of an attribute, or of a context.
+    # A file of another kind is not an archive, which shows as the lack of an attribute, or of a context.
     except (*_READ_ERRORS, AttributeError, TypeError) as error:
         raise InputError(
             f"{path}: no readable .npz file ({reason(error)}); save it again with np.savez."

@@ -25,7 +25,7 @@ def read_nuscenes(path: str | os.PathLike[str]) -> Points:
       As `jaxbox.io.read_points`; x points right and y forward.
 
     Raises:
-      InputError: where it is missing, or its size is no multiple of 20 bytes.
+      InputError: where it is missing, or its size is not a multiple of 20 bytes.
     """
     points = read_float_rows(path, _COLUMNS, "x, y, z, intensity, ring")
     return points[:, :3], points[:, 3]

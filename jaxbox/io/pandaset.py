@@ -68,7 +68,7 @@ def read_pandaset_boxes(
       The boxes, in the file's order.
 
     Raises:
-      InputError: naming file, line and field, for another number of columns or a field that is no number.
+      InputError: naming file, line and field, for another number of columns or a field that is not a number.
     """
     lines = ((number, line.split()) for number, line in enumerate(read_text(path).splitlines(), start=1))
     rows = [(words[0], _numbers(words, f"{path}, line {number}")) for number, words in lines if words]

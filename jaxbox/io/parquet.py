@@ -81,7 +81,7 @@ def _copy(path: pathlib.Path, writer: Any) -> None:
             for batch in earlier.iter_batches():
                 batch.validate(full=True)
                 writer.write_batch(batch)
-    # Bytes that are no such table, or a table with other columns.
+    # Bytes that are not such a table, or a table with other columns.
     except (arrow.ArrowException, OSError, ValueError) as error:
         raise InputError(f"{path}: its rows cannot be read ({reason(error)}); move it away.") from error
 
@@ -120,7 +120,7 @@ def finished_parquet(path: pathlib.Path) -> frozenset[str]:
       The names, also of sweeps without boxes.
 
     Raises:
-      InputError: where it is no such file.
+      InputError: where it is not such a file.
       ImportError: without the extra ``arrow``.
     """
     if not path.is_file():
@@ -131,7 +131,7 @@ def finished_parquet(path: pathlib.Path) -> frozenset[str]:
         metadata = parquet.read_metadata(path).metadata or {}
         names = json.loads(metadata[SWEEPS_KEY.encode()])
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise ValueError(f"{SWEEPS_KEY} is no list of names")
+            raise ValueError(f"{SWEEPS_KEY} is not a list of names")
         return frozenset(names)
     except (arrow.ArrowException, OSError, KeyError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: no Parquet file of jaxbox ({reason(error)}); move it away.") from error

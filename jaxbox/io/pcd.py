@@ -42,7 +42,7 @@ def read_pcd(path: str | os.PathLike[str]) -> Points:
       As `jaxbox.io.read_points`.
 
     Raises:
-      InputError: where it is no PCD file, is cut short, or has no x, y, z.
+      InputError: where it is not a PCD file, is cut short, or has no x, y, z.
       ImportError: without the extra ``pcd``.
     """
     pypcd4 = require("pypcd4", extra="pcd", what="PCD files")

@@ -41,7 +41,7 @@ def read_ply(path: str | os.PathLike[str]) -> Points:
       As `jaxbox.io.read_points`.
 
     Raises:
-      InputError: where it is no PLY file, is cut short, does not begin with its vertices, or has no x, y, z.
+      InputError: where it is not a PLY file, is cut short, has no x, y, z, or does not begin with vertices.
     """
     there = check_file(path)
     with pathlib.Path(path).open("rb") as file:
@@ -72,14 +72,14 @@ def _read_header(file: BinaryIO, where: str) -> tuple[str, int, np.dtype]:
     element, *_ = re.split(r"^(?=element )", header, flags=re.MULTILINE)[1:] or [""]
     vertex = re.match(r"element vertex (\d+)$", element, re.MULTILINE)
     if vertex is None:
-        raise InputError(f"{where}: the first element is no vertex; write the vertices before all else.")
+        raise InputError(f"{where}: the first element is not a vertex; write the vertices before all else.")
     order = _ORDERS[kind[1]]
     properties = re.findall(r"^property (.+)$", element, re.MULTILINE)
     fields = [
         (name, order + _TYPES.get(kind, "")) for kind, _, name in (p.rpartition(" ") for p in properties)
     ]
     if unknown := [name for name, kind in fields if not kind.lstrip("<>")]:
-        raise InputError(f"{where}: vertex property {unknown[0]} is no number; leave it out.")
+        raise InputError(f"{where}: vertex property {unknown[0]} is not a number; leave it out.")
     try:
         return order, int(vertex[1]), np.dtype(fields)
     # A name that occurs twice, or a number of thousands of digits.

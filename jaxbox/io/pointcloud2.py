@@ -95,7 +95,7 @@ def _point_dtype(message: PointCloud2, where: str) -> np.dtype:
                 f"{where}: field {field.name} ends at byte {field.offset + kind.itemsize} of a point of "
                 f"{message.point_step}; the message was written wrongly."
             )
-        # A count of 0 is how some drivers say 1; a list of values is no coordinate.
+        # A count of 0 is how some drivers say 1; a list of values is not a coordinate.
         if field.name and field.name not in names and field.count <= 1:
             names.append(field.name)
             formats.append(kind)

@@ -51,7 +51,7 @@ def named_points(columns: Mapping[str, np.ndarray], where: str) -> Points:
       As `jaxbox.io.read_points`.
 
     Raises:
-      InputError: where x, y or z is missing or is no number, or fields have different numbers of values.
+      InputError: where x, y or z is missing or is not a number, or fields have different numbers of values.
     """
     known = {name.lower(): values for name, values in columns.items()}
     if missing := [name for name in "xyz" if name not in known]:
@@ -205,7 +205,7 @@ def read_bin(path: str | os.PathLike[str]) -> Points:
       intensity: (n,) float32.
 
     Raises:
-      InputError: where the file is missing, or its size is no multiple of 16 bytes.
+      InputError: where the file is missing, or its size is not a multiple of 16 bytes.
     """
     points = read_float_rows(path, _VALUES_PER_POINT, "x, y, z, intensity")
     return points[:, :3], points[:, 3]
@@ -223,13 +223,13 @@ def read_float_rows(path: str | os.PathLike[str], columns: int, names: str) -> n
       (n, columns) float32.
 
     Raises:
-      InputError: where the file is missing, or its size is no whole number of rows.
+      InputError: where the file is missing, or its size is not a whole number of rows.
     """
     data = read_bytes(path)
     row = columns * np.dtype("<f4").itemsize
     if len(data) % row:
         raise InputError(
-            f"{path}: {len(data)} bytes is no multiple of {row} (float32 {names}). "
+            f"{path}: {len(data)} bytes is not a multiple of {row} (float32 {names}). "
             f"Copy the file again if it was cut short, or convert it to {columns} columns; five columns, as "
             "of nuScenes, are read from names that end in .pcd.bin."
         )

@@ -55,7 +55,7 @@ def read_points(path: str | os.PathLike[str]) -> Points:
       intensity: (n,) float32, the file's own unit; 0 where the file has none.
 
     Raises:
-      InputError: for another suffix, or naming the file and the mend where it cannot be read.
+      InputError: for another suffix, or naming the file and the fix where it cannot be read.
       ImportError: naming the extra that the format needs, where that is not installed.
     """
     found = format_of(path)

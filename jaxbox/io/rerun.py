@@ -100,7 +100,7 @@ def _image_lines(record: Mapping[str, Any], calibration: Calibration) -> tuple[n
     if len(yaw) == 0:
         return np.zeros((0, 2, 2)), np.zeros((0, 3), np.uint8)
     count = len(yaw)
-    # Every new number of boxes would compile the projection anew.
+    # Every new number of boxes would compile the projection again.
     rows = np.arange(_BOX_STEP * -(-count // _BOX_STEP)) % count
     seen = _project_boxes(center[rows], size[rows], yaw[rows], calibration)
     keep = np.asarray(seen.edge_valid)[:count] & np.asarray(seen.visible)[:count, None]

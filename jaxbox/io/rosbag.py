@@ -21,7 +21,7 @@ from jaxbox.io.points import Points
 from jaxbox.io.recordings import Message, RecordedSweeps, RecordingFormat, choose_topic
 
 METADATA_NAME = "metadata.yaml"
-"""What a folder of ROS 2 holds beside its storage."""
+"""What a folder of ROS 2 holds besides its storage."""
 
 _TYPE = MESSAGE_TYPES[0]
 _DATABASE = ".db3"
@@ -42,7 +42,7 @@ def open_rosbag(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
       The sweeps, with the time at which each was recorded.
 
     Raises:
-      InputError: where it is no bag, or the topic has to be named.
+      InputError: where it is not a bag, or the topic has to be named.
       ImportError: without the extra ``ros``.
     """
     with _reader(path) as reader:
@@ -82,7 +82,7 @@ def _reader(path: pathlib.Path) -> Iterator[Any]:
     except Exception as error:
         raise InputError(
             f"{path}: the bag cannot be read ({reason(error)}). Copy it again; `rosbag reindex` or "
-            "`ros2 bag reindex` mends a recording that was cut short."
+            "`ros2 bag reindex` fixes a recording that was cut short."
         ) from error
 
 
@@ -100,7 +100,9 @@ def _check_schemas(path: pathlib.Path) -> None:
             rows = database.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL").fetchall()
         for name, text in rows:
             if not re.match(r"CREATE\s+(TABLE|(UNIQUE\s+)?INDEX)\s", str(text), re.IGNORECASE):
-                raise InputError(f"{file}: {name!r} is no plain table; export the recording with ros2 bag.")
+                raise InputError(
+                    f"{file}: {name!r} is not a plain table; export the recording with ros2 bag."
+                )
 
 
 def _bound_chunks(reader: Any, where: str) -> None:

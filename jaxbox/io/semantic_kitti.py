@@ -44,7 +44,7 @@ def read_semantic_labels(
     data = read_bytes(path)
     if len(data) % _BYTES_PER_LABEL:
         raise InputError(
-            f"{path}: {len(data)} bytes is no multiple of {_BYTES_PER_LABEL} (one uint32 a point). "
+            f"{path}: {len(data)} bytes is not a multiple of {_BYTES_PER_LABEL} (one uint32 a point). "
             "Copy the file again if it was cut short."
         )
     labels = np.frombuffer(data, "<u4").astype(np.int64)

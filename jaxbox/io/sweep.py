@@ -53,7 +53,7 @@ class Sweep:
                 f"{self.points_path}: its sweep would be named {self.name!r}, and results are named by it; "
                 "rename the file, or give a name without folders."
             )
-        # Bytes of a file's name that are no UTF-8 can neither be printed nor written.
+        # Bytes of a file's name that are not UTF-8 can neither be printed nor written.
         printable = os.fsencode(self.name).decode("utf-8", "backslashreplace")
         object.__setattr__(self, "name", printable)
         if self.timestamp_ns is not None and not 0 <= self.timestamp_ns < _END_OF_TIME_NS:
@@ -77,7 +77,7 @@ class Sweep:
 
         Returns:
           The camera, with the image's size; or the raw calibration's size, or 1242 x 375, where there
-          is no image. None where the sweep has no calibration.
+          is not an image. None where the sweep has no calibration.
 
         Raises:
           InputError: naming the file, where it or the image's size cannot be read.

@@ -6,7 +6,7 @@ Layouts are known at the dataset's root or any folder below:
 - KITTI tracking: ``training/velodyne/0000/000001.bin``, ``training/{calib,label_02}/0000.txt``,
   ``training/image_02/0000/000001.png``
 - KITTI raw: ``2011_09_26/2011_09_26_drive_0052_sync/{velodyne_points,image_02}/data/0000000001.*``, with the
-  calibration files beside the drive, and the times in ``velodyne_points/timestamps.txt``
+  calibration files next to the drive, and the times in ``velodyne_points/timestamps.txt``
 - Argoverse 2: ``LOG/sensors/lidar/315966265259836000.feather``
 - nuScenes: ``samples/LIDAR_TOP/*.pcd.bin``
 - plain: a folder of point files, or one, without anything else; or recordings, which hold many sweeps.
@@ -204,7 +204,7 @@ def _find_points(path: pathlib.Path, formats: Sequence[PointFormat]) -> list[pat
     """The point files of the first place that has any, all of one format."""
     layouts = list(_layout_folders(path))
     for point_format in formats:
-        # Points are taken where they lie, but .txt files beside a known layout are its calibration.
+        # Points are taken where they lie, but .txt files next to a known layout are its calibration.
         places = [*layouts, [path]] if point_format is TEXT else [[path], *layouts]
         for folders in places:
             if files := _point_files(point_format, folders):
@@ -225,7 +225,7 @@ def _point_files(point_format: PointFormat, folders: list[pathlib.Path]) -> list
     files = [file for folder in folders for file in sorted(folder.iterdir()) if not file.name.startswith(".")]
     files = [file for file in files if format_of(file) is point_format]
     if point_format is TEXT and files:
-        # One kind of text only: a .csv beside .xyz files is something else.
+        # One kind of text only: a .csv next to .xyz files is something else.
         suffix = min((file.suffix.lower() for file in files), key=TEXT.suffixes.index)
         return [file for file in files if file.suffix.lower() == suffix]
     return files

@@ -79,7 +79,7 @@ def detect_on(
     Returns:
       The detections, which may still be computing.
     """
-    # An array that was put on a device is tied to it, and JAX compiles anew for it even where it already was.
+    # An array that was put on a device is tied to it, and JAX compiles for it again.
     if device not in _devices_of(cloud.xyz1):
         cloud, key = jax.device_put((cloud, key), device)
     return detect(cloud, config, key)

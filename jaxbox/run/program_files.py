@@ -16,7 +16,7 @@ _DIGEST_SIZE = hashlib.sha256().digest_size
 
 
 class BrokenProgramError(ValueError):
-    """A file that is no program, or not the one that was written."""
+    """A file that is not a program, or not the one that was written."""
 
 
 def write_program(path: pathlib.Path, exported: jax.export.Exported, made_of: Mapping[str, str]) -> None:

@@ -1,7 +1,7 @@
 """The detector's traced programs, kept between runs: tracing takes seconds, reading what was traced does not.
 
 JAX's compilation cache keeps what the compiler makes of a program, but to find it there JAX traces the
-program first, in every process anew.
+program first, in every process again.
 """
 
 import contextlib

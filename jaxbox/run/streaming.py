@@ -61,7 +61,7 @@ def stream(
 
     With one worker a thread reads and pads the next sweeps while some are computed, into buffers that are
     used again, and the devices take turns, see `detect_batch`: to use all cores of a CPU, ask for several
-    devices. With more workers, each sweep is read, padded and computed by one of so many processes, which
+    devices. With more workers, each sweep is read, padded and computed by one of that many processes, which
     a script must start under ``if __name__ == "__main__":``. Each device and each process compiles, or takes
     the program from JAX's compilation cache where that is on.
 

@@ -211,7 +211,7 @@ def summarise(
 
 
 def _capacities(counts: Counts, num_rows: int, config: DetectorConfig) -> Sequence[CapacityUse]:
-    """Every capacity beside what it had to hold, in the order of the stages."""
+    """Every capacity next to what it had to hold, in the order of the stages."""
     uses = [CapacityUse(CLOUD_CAPACITY, counts.num_points, num_rows)]
     for row in CAPACITIES:
         sizes = row.sizes(config, num_rows)

@@ -1,4 +1,4 @@
-"""A calibrated camera beside the sensor, and its picture of a scene."""
+"""A calibrated camera next to the sensor, and its picture of a scene."""
 
 import jax.numpy as jnp
 import numpy as np

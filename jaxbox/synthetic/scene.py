@@ -1,4 +1,4 @@
-"""The layout of a street: vehicles on and beside a road, buildings, hedges, trees and poles."""
+"""The layout of a street: vehicles on and next to a road, buildings, hedges, trees and poles."""
 
 import dataclasses
 import enum
@@ -163,7 +163,7 @@ def make_scene(
       A scene round the sensor, which stands on the right lane of the road.
 
     Raises:
-      ValueError: where so many vehicles find no room, or for an option out of range.
+      ValueError: where that many vehicles find no room, or for an option out of range.
 
     >>> " ".join(v.label.name for v in make_scene(3, num_vehicles=2).vehicles)
     'CAR CAR'

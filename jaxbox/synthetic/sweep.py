@@ -156,7 +156,7 @@ def scan(
       num_beams: beams between +2 and -24.33 degrees, spaced as an HDL-64E's.
       num_azimuths: firings a turn.
       range_noise_m: standard deviation of the range, m; the direction is exact.
-      dropout: share of returns lost at random, beside those too weak to detect.
+      dropout: share of returns lost at random, besides those too weak to detect.
       image: whether the camera's picture is rendered too.
 
     Returns:

@@ -18,7 +18,7 @@ Match = TypeVar("Match")
 """What a score is made of, for one frame."""
 
 NOISE = 1.0
-"""Points of the objective that turning the sweeps alone can move; smaller gains are no evidence."""
+"""Points of the objective that turning the sweeps alone can move; smaller gains are not evidence."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -47,7 +47,7 @@ class Frame:
     read_s: float = 0.0
     """Seconds of reading."""
     problems: tuple[str, ...] = ()
-    """What could not be read beside the points, in words."""
+    """What could not be read besides the points, in words."""
 
     @classmethod
     def read(cls, sweep: io.Sweep, *, capacity: int | None = None) -> "Frame":

@@ -243,7 +243,7 @@ def _height_above_ground(frame: Frame, detections: Detections | None) -> np.ndar
 
 
 def _inside_any(xyz: np.ndarray, boxes: BoxSet) -> np.ndarray:
-    """(n,) bool: within one of the boxes, or a hand's breadth beside it; not below, where the road is."""
+    """(n,) bool: within one of the boxes, or a hand's breadth next to it; not below, where the road is."""
     inside = np.zeros(len(xyz), bool)
     for center, size, yaw in zip(boxes.center, boxes.size, boxes.yaw.tolist(), strict=True):
         x, y, z = (xyz - center).T

@@ -64,7 +64,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         Threshold(
             name="filtering.num_std",
             label="deviations",
-            hint="A point farther from its centroid than the mean and so many deviations is an outlier.",
+            hint="A point farther from its centroid than the mean and that many deviations is an outlier.",
             low=0.5,
             high=16.0,
             step=0.5,
@@ -224,7 +224,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         Threshold(
             name="vehicles.upright_score",
             label="upright",
-            hint="Worth of a box whose upper points are all on its faces, such as a wall's or a hedge's.",
+            hint="Factor of the score where all upper points are on the faces, as a wall's or a hedge's are.",
             low=0.0,
             high=1.0,
             step=0.05,

@@ -119,7 +119,7 @@ class Viewer:
             self.want(view=dataclasses.replace(self._wanted.view, **changes))
 
     def step(self, count: int) -> None:
-        """Asks for the sweep so many further on, round the end; any thread may."""
+        """Asks for the sweep that many further on, round the end; any thread may."""
         with self._changed:
             self.want(index=(self._wanted.index + count) % len(self._session))
 

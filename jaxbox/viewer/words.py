@@ -63,7 +63,7 @@ def describe(shown: Shown, session: Session, *, index: int, min_score: float) ->
 
 
 def describe_status(shown: Shown) -> str:
-    """What was dropped, and what could not be read beside the points.
+    """What was dropped, and what could not be read besides the points.
 
     Args:
       shown: what is on the page.
@@ -117,7 +117,7 @@ def describe_error(message: str, *, index: int, count: int) -> str:
     """An error in place of an answer.
 
     Args:
-      message: what went wrong, and the mend.
+      message: what went wrong, and the fix.
       index: number of the sweep, from 0.
       count: how many there are.
 
