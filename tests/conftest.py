@@ -27,6 +27,7 @@ FAST = {
 }  # fmt: skip
 """Files whose tests make up ``pytest -m fast``, but for the tests in `SLOW`."""
 SLOW = {
+    "test_another_class_is_one_entry_in_one_file",
     "rounds",
     "test_the_pipeline_strip_is_of_this_detector",
     "test_the_proposed_capacities_hold_the_sweeps_they_were_proposed_for",

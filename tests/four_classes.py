@@ -62,7 +62,24 @@ def check_synthetic(bus):
     assert set(reference.detect(sweep.xyz).label) <= set(Label)
 
 
+def check_detection(bus):
+    """The compiled detector tries it, and calls a box so that no other class fits."""
+    sweep = synthetic.make_sweep(3, num_beams=32, num_azimuths=512)
+    cloud = jaxbox.PointCloud.from_numpy(sweep.xyz, capacity=2**14)
+    found = jaxbox.detect(cloud).on_host()
+    assert found.valid.any()
+    assert set(found.label[found.valid]) <= set(Label)
+    # As if nothing else drove there: what was a car is taken for the only class that has a car's size.
+    config = DetectorConfig()
+    car, *others, _ = config.vehicles.classes
+    nothing = [dataclasses.replace(prior, prior_weight=0.0) for prior in (car, *others)]
+    vehicles = dataclasses.replace(config.vehicles, classes=(*nothing, car), large_height_m=0.5)
+    found = jaxbox.detect(cloud, dataclasses.replace(config, vehicles=vehicles)).on_host()
+    assert found.valid.any()
+    assert set(found.label[found.valid]) == {bus}
+
+
 if __name__ == "__main__":
     assert jaxbox.__file__.startswith(sys.argv[1]), jaxbox.__file__
-    for check in (check_config, check_words, check_synthetic):
+    for check in (check_config, check_words, check_synthetic, check_detection):
         check(Label["BUS"])
