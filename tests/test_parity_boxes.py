@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import parity
 import pytest
-from test_masked import count_loops
+from native_loops import count_loops
 
 from jaxbox import DetectorConfig, detector, reference
 from jaxbox.config import HullConfig

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import parity
 import pytest
-from jaxbox.reference.clusters import NO_CLUSTER
+from native_loops import count_loops
 from scipy import ndimage
-from test_masked import count_loops
 
 from jaxbox import reference
 from jaxbox.config import ComponentMap, DetectorConfig
+from jaxbox.reference.clusters import NO_CLUSTER
 from jaxbox.stages import clustering
 from jaxbox.xla import backend, chunks, ragged
 from jaxbox.xla.components import NONE, STRIP_WORDS, CellGrids, _prefix, label_components
