@@ -18,7 +18,7 @@ from scipy import sparse
 from benchmarks import common
 from jaxbox import DetectorConfig
 from jaxbox.io import open_sweeps
-from jaxbox.reference import NO_CLUSTER, euclidean_clusters, keep_clusters
+from jaxbox.reference import NO_CLUSTER, euclidean_clusters, select_clusters
 
 RADII_M = (0.5, 0.6, 0.7)
 """The paper's preset has cells of 0.35 m; these are 1.4 to 2 of their edges."""
@@ -75,7 +75,7 @@ def share_in_same_clusters(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def agreement(
-    xyz: np.ndarray, component: np.ndarray, *, radius_m: float, gates: dict[str, Any]
+    xyz: np.ndarray, component: np.ndarray, *, radius_m: float, config: DetectorConfig
 ) -> dict[str, float]:
     """Holds grid components against Euclidean clusters of the same points.
 
@@ -83,15 +83,19 @@ def agreement(
       xyz: (n, 3) m.
       component: (n,) int, of the grid, not negative.
       radius_m: longest hop of the Euclidean clusters.
-      gates: size gates, see `jaxbox.reference.keep_clusters`.
+      config: with the size gates, see `jaxbox.reference.select_clusters`.
 
     Returns:
       The index over all points, the share in clusters that are the same, and the numbers of clusters.
     """
     _, component = np.unique(component, return_inverse=True)
     euclidean = euclidean_clusters(xyz, radius_m=radius_m)
-    grid_slot, num_grid = keep_clusters(xyz[:, :2], component, **gates)
-    euclidean_slot, num_euclidean = keep_clusters(xyz[:, :2], euclidean, **gates)
+
+    def select(labels: np.ndarray) -> tuple[np.ndarray, int]:
+        least = float(config.vehicles.min_extent_m)
+        return select_clusters(xyz[:, :2], labels, config.clustering, min_extent_m=least)
+
+    (grid_slot, num_grid), (euclidean_slot, num_euclidean) = select(component), select(euclidean)
     return {
         "rand_index": adjusted_rand_index(component, euclidean),
         "share_same": share_in_same_clusters(grid_slot, euclidean_slot),
@@ -109,17 +113,12 @@ def grid_components(xyz: np.ndarray, config: DetectorConfig) -> tuple[np.ndarray
 
 def bench(folder: pathlib.Path, config: DetectorConfig, radii: Sequence[float]) -> list[dict[str, Any]]:
     """One row a sweep and radius."""
-    gates: dict[str, Any] = {
-        "min_points": config.clustering.min_points,
-        "min_extent_m": config.vehicles.min_extent_m,
-        "max_extent_m": config.clustering.max_extent_m,
-    }
     rows = []
     for sweep in open_sweeps(folder):
         xyz, component = grid_components(sweep.read_points()[0], config)
         rows += [
             {"sweep": sweep.name, "points": len(xyz), "radius_m": radius}
-            | agreement(xyz, component, radius_m=radius, gates=gates)
+            | agreement(xyz, component, radius_m=radius, config=config)
             for radius in radii
         ]
     return rows

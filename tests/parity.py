@@ -7,22 +7,14 @@ import dataclasses
 import functools
 import pathlib
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxbox.reference.proposals import (
-    Obstacles,
-    Proposal,
-    find_clusters,
-    index_obstacles,
-    make_proposals,
-    select_options,
-)
 
 from jaxbox import reference, synthetic
-from jaxbox.config import ComponentMap, DetectorConfig
+from jaxbox.config import DetectorConfig
 from jaxbox.stages.state import Evidence
 from jaxbox.xla import backend
 from jaxbox.xla.ragged import PointLists
@@ -39,13 +31,6 @@ MAX_CLUSTERS = 512
 """Rows for the clusters of one map."""
 
 CONFIG = DetectorConfig()
-REGION = select_options(CONFIG.region, "half_x_m", "half_y_m")
-SURFACE_GRID = {"cell_m": CONFIG.ground.surface_cell_m, "half_m": CONFIG.ground.surface_half_m}
-SURFACE = SURFACE_GRID | select_options(
-    CONFIG.ground,
-    *("num_envelope_rounds", "max_grade", "band_below_m", "band_below_grade", "band_above_m"),
-    *("band_above_grade", "blind_radius_m", "envelope_margin_m", "smoothing_m"),
-)
 
 
 class PerForm:
@@ -77,11 +62,6 @@ def in_both_forms(function, *args, **named):
     return results
 
 
-def all_options(config, *drop):
-    names = (field.name for field in dataclasses.fields(config))
-    return select_options(config, *(name for name in names if name not in drop))
-
-
 def pad(rows, capacity, fill=0):
     """Rows for a stage: float32 or int32, padded to a capacity."""
     rows = np.asarray(rows)
@@ -106,6 +86,19 @@ def padded_mask(count, capacity):
     return jnp.arange(capacity) < count
 
 
+class Proposal(NamedTuple):
+    """A cluster, and the rectangles round it at all rotations."""
+
+    members: np.ndarray
+    """(k,) int: rows of its points among the obstacles."""
+    xy: np.ndarray
+    """(j, 2) m: the points that rectangles are fitted to."""
+    curve: np.ndarray
+    """(A,): criterion at each rotation."""
+    extents: np.ndarray
+    """(A, 4) m: see `reference.try_rotations`."""
+
+
 @dataclasses.dataclass(eq=False)
 class Case:
     """One sweep, and the results of the reference's stages on it, rounded to float32."""
@@ -116,62 +109,63 @@ class Case:
 
     @functools.cached_property
     def inlier(self) -> np.ndarray:
-        return reference.filter_outliers(self.xyz, **REGION, **all_options(CONFIG.filtering, "enabled"))
+        return reference.filter_outliers(self.xyz, CONFIG.filtering, CONFIG.region)
 
     @functools.cached_property
     def candidates(self) -> np.ndarray:
-        half = {"half_x_m": CONFIG.ground.candidate_half_x_m, "half_y_m": CONFIG.ground.candidate_half_y_m}
-        return reference.cell_minima(self.xyz[self.inlier], **half).astype(np.float32)
+        return reference.cell_minima(self.xyz[self.inlier], CONFIG.ground).astype(np.float32)
 
     @functools.cached_property
     def plane(self) -> np.ndarray:
-        names = ("num_hypotheses", "num_refits", "tolerance_m", "max_slope_deg", "min_inlier_fraction")
-        options = select_options(CONFIG.ground, *names)
         plane, found, _ = reference.fit_ground_plane(
-            self.candidates.astype(float), rng=np.random.default_rng(0), **options
+            self.candidates.astype(float), CONFIG.ground, rng=np.random.default_rng(0)
         )
         assert found
         return plane.astype(np.float32)
 
     @functools.cached_property
     def surface(self) -> np.ndarray:
-        grid = reference.fit_ground_surface(self.xyz[self.inlier].astype(float), self.plane, **SURFACE)
-        return grid.astype(np.float32)
+        xyz = self.xyz[self.inlier].astype(float)
+        return reference.fit_ground_surface(xyz, self.plane, CONFIG.ground).astype(np.float32)
 
     @functools.cached_property
     def height(self) -> np.ndarray:
         """(n,) float32, m, of all points, outliers too."""
         xyz = self.xyz.astype(float)
-        return reference.height_above_ground(xyz, self.plane, self.surface, **SURFACE_GRID).astype(np.float32)
+        height = reference.height_above_ground(xyz, self.plane, self.surface, CONFIG.ground)
+        return height.astype(np.float32)
 
     @functools.cached_property
-    def obstacles(self) -> Obstacles:
+    def obstacles(self) -> reference.Obstacles:
         low, high = CONFIG.ground.min_height_m, CONFIG.ground.max_height_m
         rows = np.flatnonzero(self.inlier & (self.height > low) & (self.height < high))
         assert len(rows) <= MAX_OBSTACLES
-        return index_obstacles(self.xyz.astype(float), self.height.astype(float), rows)
-
-    def cluster_map(self, component_map: ComponentMap) -> tuple[np.ndarray, np.ndarray, tuple[int, int]]:
-        return find_clusters(self.obstacles, component_map, CONFIG)
+        return reference.index_obstacles(self.xyz.astype(float), self.height.astype(float), rows)
 
     @functools.cached_property
+    def first_map(self) -> reference.Clusters:
+        return reference.find_clusters(self.obstacles, CONFIG.clustering.maps[0], CONFIG)
+
+    @property
     def slot(self) -> np.ndarray:
         """(m,) cluster of each obstacle in the first map, -1 for none."""
-        return self.cluster_map(CONFIG.clustering.maps[0])[1]
+        return self.first_map.of_point
 
     @functools.cached_property
     def proposals(self) -> list[Proposal]:
         """Of the first map."""
-        return make_proposals(self.obstacles, self.slot, CONFIG)
+        clusters = self.first_map.clusters
+        outlines = reference.outline_clusters(self.obstacles, clusters, CONFIG)
+        fits = reference.fit_rectangles(outlines, CONFIG.box)
+        return [
+            Proposal(cluster.members, xy, rotations.curve, rotations.extents)
+            for cluster, xy, rotations in zip(clusters, outlines, fits, strict=True)
+        ]
 
     @functools.cached_property
     def evidence(self) -> reference.Evidence:
-        return reference.build_evidence(
-            self.xyz[self.inlier].astype(float),
-            self.height[self.inlier].astype(float),
-            sensor_height_m=-float(self.plane[2]),
-            **all_options(CONFIG.evidence, "enabled"),
-        )
+        xyz, height = self.xyz[self.inlier].astype(float), self.height[self.inlier].astype(float)
+        return reference.build_evidence(xyz, height, -float(self.plane[2]), CONFIG.evidence)
 
     def evidence_as_input(self) -> Evidence:
         """The reference's evidence in the layout of the compiled stages."""
@@ -196,18 +190,15 @@ class Case:
 
 
 def complete(proposal, angle, prior, evidence, mode="evidence"):
-    readings = [
-        reference.Reading(proposal.extents[a], a * np.pi / 2 / len(proposal.curve), float(proposal.curve[a]))
+    """The reference's box of a proposal, of its rectangles at some rotations."""
+    rectangles = [
+        reference.Rectangle(
+            proposal.extents[a], a * np.pi / 2 / len(proposal.curve), float(proposal.curve[a])
+        )
         for a in np.atleast_1d(angle)
     ]
-    return reference.complete_box(
-        proposal.xy,
-        readings,
-        evidence=evidence,
-        mode=mode,
-        **select_options(prior, "length_m", "width_m", "max_length_m", "max_width_m"),
-        **all_options(CONFIG.completion, "mode", "num_final_rays", "along_scene", "max_assignments"),
-    )
+    config = dataclasses.replace(CONFIG.completion, mode=mode)
+    return reference.complete_box(proposal.xy, rectangles, prior, evidence, config)
 
 
 @functools.lru_cache
@@ -230,7 +221,7 @@ def real_cases(data_root: pathlib.Path) -> tuple[Case, ...]:
 
 
 def _case(name: str, xyz: np.ndarray) -> Case:
-    return Case(name, xyz[reference.select_points(xyz, **REGION)[1]])
+    return Case(name, xyz[reference.select_points(xyz, CONFIG.filtering, CONFIG.region).in_region])
 
 
 def padded_points(cases):

@@ -44,11 +44,9 @@ def test_a_cluster_is_the_same_only_where_both_share_nine_tenths_of_it(bench):
 
 def test_grid_components_of_real_sweeps_agree_with_euclidean_clusters(bench, data_root):
     config = DetectorConfig.paper()
-    gates = parity.select_options(config.clustering, "min_points", "max_extent_m")
-    gates |= parity.select_options(config.vehicles, "min_extent_m")
     for case in parity.real_cases(data_root)[2:4]:
         xyz, component = bench.grid_components(case.xyz, config)
-        result = bench.agreement(xyz, component, radius_m=RADIUS_M, gates=gates)
+        result = bench.agreement(xyz, component, radius_m=RADIUS_M, config=config)
         assert result["rand_index"] > 0.93
         assert result["share_same"] > 0.65
         assert result["grid_clusters"] == pytest.approx(result["euclidean_clusters"], rel=0.1)

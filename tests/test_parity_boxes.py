@@ -100,7 +100,7 @@ def assert_same_hull(vertices, expected, what):
     vertices, expected = vertices.astype(float), expected.astype(float)
     # Rounding drops points less than a nanometre off a line: in areas below a square centimetre it shows.
     scale = max(1e-3 * np.prod(np.ptp(expected, axis=0)), 1e-4)
-    area, expected_area = reference.signed_area(vertices), abs(reference.signed_area(expected))
+    area, expected_area = reference.polygon_area(vertices), abs(reference.polygon_area(expected))
     parity.assert_within((area - expected_area) / max(expected_area, scale), 1e-5, f"area {what}")
     ours, theirs = set(map(tuple, vertices)), set(map(tuple, expected))
     for extra, polygon in ((ours - theirs, expected), (theirs - ours, vertices)):
@@ -118,7 +118,7 @@ def test_hulls_of_random_points_are_those_of_opencv(size):
         assert 3 <= num <= MAX_VERTICES
         assert_same_hull(ours[:num], opencv_hull(xy), "random")
         assert float(area) == pytest.approx(
-            reference.signed_area(ours[:num].astype(float)), rel=1e-4, abs=1e-6
+            reference.polygon_area(ours[:num].astype(float)), rel=1e-4, abs=1e-6
         )
 
 
@@ -228,7 +228,9 @@ def test_hulls_of_clusters_are_those_of_opencv(cases, platform):
                 assert_same_hull(ours, opencv_hull(points[k, : count[k]]), "cluster")
                 # The reference's own hull, of all the same points.
                 expected = reference.convex_hull(proposal.xy)
-                assert abs(reference.signed_area(ours.astype(float)) - reference.signed_area(expected)) < 1e-3
+                assert (
+                    abs(reference.polygon_area(ours.astype(float)) - reference.polygon_area(expected)) < 1e-3
+                )
 
 
 @pytest.mark.usefixtures("platform")
@@ -290,9 +292,9 @@ def fits_of(cases):
 @pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("criterion", CRITERIA)
 def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, criterion):
-    options = {"num_angles": SETTINGS.num_angles, "min_distance_m": SETTINGS.min_distance_m}
+    config = dataclasses.replace(SETTINGS, criterion=criterion)
     points, count, fits = fits_of(cases)
-    curves, extents = try_rotations(*fits, dataclasses.replace(SETTINGS, criterion=criterion))
+    curves, extents = try_rotations(*fits, config)
     best = rectangles.best_rectangles(curves, extents, jnp.zeros(SETTINGS.num_angles))
     angle, low, high = (np.asarray(values) for values in (best.angle, best.low, best.high))
     curves, extents = np.asarray(curves).T, np.stack(extents).transpose(2, 1, 0)
@@ -300,7 +302,7 @@ def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, cr
     wrong = worse = 0
     for k in range(len(count)):
         xy = points[k, : count[k]].astype(float)
-        expected, bounds = reference.criterion_curve(xy, criterion=criterion, **options)
+        expected, bounds = reference.try_rotations(xy, config)
         parity.assert_within(extents[k] - bounds, 3e-5, "m of extents")
         scale = 1 if "closeness" in criterion else max(np.ptp(expected), 0.1)
         wrong += np.sum(np.abs(curves[k] - expected) > 1e-3 * scale)
@@ -341,18 +343,14 @@ def test_a_cluster_without_points_has_no_extents_and_a_finite_curve(criterion):
 @pytest.mark.usefixtures("platform")
 def test_scene_direction_is_that_of_the_reference():
     rng = np.random.default_rng(0)
-    options = {"num_angles": 90, "sigma_deg": SETTINGS.direction_sigma_deg}
     for _ in range(50):
         count = rng.integers(0, 12)
         yaw, extent = rng.uniform(-4, 4, count), rng.uniform(0, 9, count)
         num_points, free = rng.integers(5, 400, count), rng.uniform(0, 0.3, count)
-        limits = {"min_extent_m": SETTINGS.direction_min_extent_m, "max_free": SETTINGS.direction_max_free}
-        voting = (extent >= limits["min_extent_m"]) & (free <= limits["max_free"])
-        expected = reference.direction_preference(
-            reference.scene_direction(yaw, extent, num_points, free, **options, **limits),
-            weight=SETTINGS.direction_weight,
-            **options,
-        )
+        least, most = SETTINGS.direction_min_extent_m, SETTINGS.direction_max_free
+        voting = (extent >= least) & (free <= most)
+        np.testing.assert_array_equal(reference.may_vote(extent, free, SETTINGS), voting)
+        expected = reference.count_votes(yaw, extent, num_points, voting, SETTINGS)
         rows = (parity.pad(value, 16) for value in (yaw, extent, num_points, voting))
         preference = count_votes(*rows, SETTINGS)
         parity.assert_within(preference - expected, 1e-4, "preference")
@@ -364,16 +362,10 @@ def test_scene_direction_of_sweeps_is_that_of_the_reference(cases):
         yaw = np.array([done.box[4] for _, done in fits])
         extent = np.array([max(done.measured_length_m, done.measured_width_m) for _, done in fits])
         num_points = np.array([len(p.members) for p, _ in fits])
-        options = {"num_angles": SETTINGS.num_angles, "sigma_deg": SETTINGS.direction_sigma_deg}
-        least = SETTINGS.direction_min_extent_m
-        direction = reference.scene_direction(
-            yaw, extent, num_points, np.zeros(len(yaw)), min_extent_m=least, max_free=1.0, **options
-        )
-        rows = (
-            parity.pad(value, parity.MAX_CLUSTERS) for value in (yaw, extent, num_points, extent >= least)
-        )
-        preference = count_votes(*rows, SETTINGS)
-        assert direction == np.argmax(np.asarray(preference))
+        votes = yaw, extent, num_points, extent >= SETTINGS.direction_min_extent_m
+        expected = reference.count_votes(*votes, SETTINGS)
+        preference = count_votes(*(parity.pad(value, parity.MAX_CLUSTERS) for value in votes), SETTINGS)
+        assert np.argmax(expected) == np.argmax(np.asarray(preference))
 
 
 @pytest.mark.usefixtures("platform")
@@ -382,7 +374,7 @@ def test_descriptors_are_those_of_the_reference(cases):
         xy = case.obstacles.xyz[:, :2].astype(np.float32)
         slot = np.where(case.slot < 0, parity.MAX_CLUSTERS, case.slot)
         members = [xy[case.slot == k].astype(float) for k in range(len(case.proposals))]
-        hulls = [reference.convex_hull(m) for m in members]
+        hulls = reference.convex_hulls(members)
         expected = [reference.shape_descriptors(m, h) for m, h in zip(members, hulls, strict=True)]
         moments = point_moments(
             parity.pad(slot, parity.MAX_OBSTACLES, parity.MAX_CLUSTERS),
@@ -394,7 +386,7 @@ def test_descriptors_are_those_of_the_reference(cases):
         )
         ours = shape_descriptors(
             moments,
-            parity.pad(np.array([abs(reference.signed_area(h)) for h in hulls]), parity.MAX_CLUSTERS),
+            parity.pad(np.array([abs(reference.polygon_area(h)) for h in hulls]), parity.MAX_CLUSTERS),
             parity.pad(np.array([len(h) for h in hulls]), parity.MAX_CLUSTERS),
         )
         ours, count = parity.on_host(ours), len(members)

@@ -13,7 +13,6 @@ from scipy import ndimage
 
 from jaxbox import reference
 from jaxbox.config import ComponentMap, DetectorConfig
-from jaxbox.reference.clusters import NO_CLUSTER
 from jaxbox.stages import clustering
 from jaxbox.xla import backend, chunks, ragged
 from jaxbox.xla.components import NONE, STRIP_WORDS, CellGrids, _prefix, label_components
@@ -21,8 +20,7 @@ from jaxbox.xla.components import NONE, STRIP_WORDS, CellGrids, _prefix, label_c
 SETTINGS = parity.CONFIG.clustering
 WARP = {"start_m": SETTINGS.adaptive_start_m, "growth": SETTINGS.adaptive_growth}
 MAPS = {"bird's-eye view": ComponentMap(cell_m=0.35), "3D": DetectorConfig.paper().clustering.maps[0]}
-GATES = parity.select_options(SETTINGS, "min_points", "max_extent_m")
-GATES |= parity.select_options(parity.CONFIG.vehicles, "min_extent_m")
+MIN_EXTENT_M = parity.CONFIG.vehicles.min_extent_m
 MAX_RUNS = 2**14
 
 
@@ -50,8 +48,8 @@ def with_room(config, sizes):
 list_points = parity.PerForm(ragged.list_points, static_argnames=("num_clusters", "max_points"))
 
 
-def cell_options(component_map: ComponentMap):
-    return parity.REGION | parity.select_options(component_map, "cell_m", "num_levels", "min_height_m")
+def reference_cells(xy, height, component_map):
+    return reference.find_cells(xy, height, component_map, parity.CONFIG.region)
 
 
 def in_row(cells, row, i):
@@ -89,7 +87,7 @@ def test_warped_points_are_those_of_the_reference(cases):
     for case in cases:
         xy = case.obstacles.xyz[:, :2]
         for growth in (0.0, WARP["growth"], 0.1):
-            expected = reference.warp_range(xy, start_m=WARP["start_m"], growth=growth)
+            expected = reference.compress_range(xy, start_m=WARP["start_m"], growth=growth)
             warped = warp(parity.pad(xy, parity.MAX_OBSTACLES), start_m=WARP["start_m"], growth=growth)
             parity.assert_within(np.asarray(warped)[: len(xy)] - expected, 5e-5, "m between warped points")
 
@@ -104,9 +102,7 @@ def test_cells_are_those_of_the_reference(cases):
         padded = [parity.pad(values, parity.MAX_OBSTACLES) for values in (xy, height)]
         found = jax.jit(find)(*padded, parity.padded_mask(len(xy), parity.MAX_OBSTACLES))
         for i, component_map in enumerate(maps):
-            cells, shape = reference.grid_cells(
-                xy.astype(float), height.astype(float), **cell_options(component_map)
-            )
+            cells, shape = reference_cells(xy.astype(float), height.astype(float), component_map)
             assert shape == row.shapes[i]
             member = (height > component_map.min_height_m) & (height < component_map.max_height_m)
             expected = np.where(member, in_row(cells, row, i), NONE)
@@ -124,7 +120,7 @@ def test_cells_are_those_of_the_reference(cases):
 @pytest.mark.usefixtures("platform")
 def test_components_are_exactly_those_of_the_reference(cases):
     for case in cases:
-        grids = [reference.grid_cells(*members_of(case, m), **cell_options(m)) for m in MAPS.values()]
+        grids = [reference_cells(*members_of(case, m), m) for m in MAPS.values()]
         row = CellGrids(tuple(shape for _, shape in grids))
         cells = [
             parity.pad(in_row(cells, row, i), parity.MAX_OBSTACLES) for i, (cells, _) in enumerate(grids)
@@ -292,8 +288,8 @@ def test_runs_beyond_the_capacity_join_nothing():
 def test_clusters_that_pass_the_gates_are_exactly_those_of_the_reference(cases, name):
     for case in cases:
         xy, height = members_of(case, MAPS[name])
-        component = reference.label_components(*reference.grid_cells(xy, height, **cell_options(MAPS[name])))
-        slot, count = reference.keep_clusters(xy, component, **GATES)
+        component = reference.label_components(*reference_cells(xy, height, MAPS[name]))
+        slot, count = reference.select_clusters(xy, component, SETTINGS, min_extent_m=MIN_EXTENT_M)
         in_slab = np.arange(len(xy)) % 3 == 0
         clusters = select_clusters(
             parity.pad(1 + component, parity.MAX_OBSTACLES)[None],
@@ -302,10 +298,10 @@ def test_clusters_that_pass_the_gates_are_exactly_those_of_the_reference(cases, 
             parity.pad(in_slab, parity.MAX_OBSTACLES),
             np.array([1, 2 + component.max()]),
             with_room(SETTINGS, [parity.MAX_CLUSTERS]),
-            parity.CONFIG.vehicles.min_extent_m,
+            MIN_EXTENT_M,
         )
         clusters = parity.on_host(clusters)
-        expected = np.where(slot == NO_CLUSTER, parity.MAX_CLUSTERS, slot)
+        expected = np.where(slot == reference.NO_CLUSTER, parity.MAX_CLUSTERS, slot)
         np.testing.assert_array_equal(clusters.row[1 + component], expected)
         assert clusters.row[0] == parity.MAX_CLUSTERS
         assert clusters.found[0] == clusters.kept[0] == count > 10
@@ -343,11 +339,9 @@ def test_the_lists_of_the_maps_join_without_gaps_and_end_at_their_capacities():
 @pytest.mark.usefixtures("platform")
 def test_fitted_points_are_exactly_those_of_the_reference(cases):
     settings = parity.CONFIG.box
-    limits = parity.select_options(settings, "min_slab_points", "max_points")
-    slab = {"min_height_m": settings.slab_min_height_m, "max_height_m": settings.slab_max_height_m}
     for case in cases:
         height = case.obstacles.height
-        in_slab = (height > slab["min_height_m"]) & (height < slab["max_height_m"])
+        in_slab = (height > settings.slab_min_height_m) & (height < settings.slab_max_height_m)
         few = np.bincount(case.slot[in_slab & (case.slot >= 0)], minlength=len(case.proposals))
         few = few < settings.min_slab_points
         used = (case.slot >= 0) & (in_slab | few[case.slot])
@@ -364,6 +358,6 @@ def test_fitted_points_are_exactly_those_of_the_reference(cases):
         x, y, count = map(np.asarray, lists.table(np.arange(parity.MAX_CLUSTERS)))
         assert not count[len(case.proposals) :].any()
         for row, proposal in enumerate(case.proposals):
-            expected = reference.fit_points(proposal.members, height, **slab, **limits)
+            expected = reference.fit_points(proposal.members, height, settings)
             points = np.stack([x[: count[row], row], y[: count[row], row]], axis=1)
             np.testing.assert_array_equal(points, xy[expected])

@@ -1,7 +1,6 @@
 """Parity with the reference end to end: the same boxes from the same sweep, for all presets."""
 
 import functools
-import importlib
 
 import numpy as np
 import parity
@@ -9,15 +8,13 @@ import pytest
 
 import jaxbox
 from jaxbox import DetectorConfig, reference
+from jaxbox.reference import ground as reference_ground
 from jaxbox.xla import backend
 
 MIN_SCORE = 0.05
 PRESETS = DetectorConfig.presets()
 SWEEPS = slice(1, 3)
 """Two of each kind, as the reference takes seconds for each."""
-
-# The package exports the function under the module's name.
-reference_detector = importlib.import_module("jaxbox.reference.detector")
 
 
 def boxes_of(detections):
@@ -75,7 +72,7 @@ def owners_of(detections, num_points, min_score):
 def test_on_one_ground_plane_both_find_the_same_boxes_of_the_same_points(cases, preset, monkeypatch):
     def use_plane(plane):
         fit = plane.coefficients.astype(float), bool(plane.found), int(plane.num_inliers)
-        monkeypatch.setattr(reference_detector, "fit_ground_planes", lambda *_, **__: [fit])
+        monkeypatch.setattr(reference_ground, "fit_ground_planes", lambda *_, **__: [fit])
 
     pairs = list(both(cases, preset, use_plane))
     bad, total = missing(pairs)

@@ -97,7 +97,7 @@ def test_ground_support_is_looked_up_where_the_reference_does(cases):
     rng = np.random.default_rng(0)
     for case in cases:
         xy = rng.uniform(-120, 120, (64, 2)).astype(np.float32)
-        expected = [reference.support_at(place, case.evidence) for place in xy.astype(float)]
+        expected = reference.ground_support(case.evidence, xy.astype(float))
         np.testing.assert_array_equal(ground_support(case.evidence_as_input(), xy), expected)
 
 
@@ -107,7 +107,7 @@ def test_rays_over_boxes_end_as_in_the_reference(cases):
     for case in cases:
         found = [done.box for _, done in case.boxes if done is not None]
         boxes = np.concatenate([random_boxes(512, rng), np.array(found, np.float32)])
-        expected = reference.box_evidence(boxes.astype(float), case.evidence, num_rays=NUM_RAYS)
+        expected = reference.cast_rays(case.evidence, boxes.astype(float), num_rays=NUM_RAYS)
         rays = parity.on_host(cast_rays(case.evidence_as_input(), parity.pad(boxes, 1024)))
         differ = np.zeros(len(boxes), bool)
         for kind in ("hit", "free", "deep", "occluded", "free_length"):

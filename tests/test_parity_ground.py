@@ -11,9 +11,7 @@ from jaxbox import reference
 from jaxbox.config import RegionConfig
 from jaxbox.stages import filtering, ground
 
-FILTER = parity.all_options(parity.CONFIG.filtering, "enabled")
 GROUND = parity.CONFIG.ground
-CANDIDATE_HALF = {"half_x_m": GROUND.candidate_half_x_m, "half_y_m": GROUND.candidate_half_y_m}
 MAX_CANDIDATES = 3200
 
 filter_outliers = parity.PerForm(filtering.filter_outliers)
@@ -26,10 +24,9 @@ height_above_ground = jax.jit(ground.height_above_ground)
 @pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("changes", [{}, {"num_std": 1.5, "min_density": 3.0, "bandwidth_m": 0.7}])
 def test_filter_keeps_the_points_that_the_reference_keeps(cases, changes):
-    options = parity.REGION | FILTER | changes
     config = dataclasses.replace(parity.CONFIG.filtering, **changes)
     for case in cases:
-        expected = reference.filter_outliers(case.xyz, **options)
+        expected = reference.filter_outliers(case.xyz, config, parity.CONFIG.region)
         xyz1 = np.pad(case.xyz, ((0, 0), (0, 1)), constant_values=1)
         keep = np.asarray(filter_outliers(parity.pad(xyz1, parity.CAPACITY), config, parity.CONFIG.region))
         assert 0 < (~expected).sum() < len(expected) / 3
@@ -82,14 +79,13 @@ def test_planes_of_different_draws_agree_where_one_has_decisive_support(cases):
 # Gaussians of the default reach as far as the band of their matrix, the wider ones beyond it.
 @pytest.mark.parametrize("wider", [0.5, 1, 2])
 def test_surface_is_that_of_the_reference_on_the_same_plane(cases, wider):
-    options = parity.SURFACE | {"smoothing_m": wider * parity.SURFACE["smoothing_m"]}
-    config = dataclasses.replace(GROUND, smoothing_m=options["smoothing_m"])
+    config = dataclasses.replace(GROUND, smoothing_m=wider * GROUND.smoothing_m)
     for case in cases:
         xyz = parity.pad(case.xyz, parity.CAPACITY)
         mask = parity.pad(case.inlier, parity.CAPACITY)
         surface = np.asarray(fit_ground_surface(xyz, mask, case.plane, config))
         inliers = case.xyz[case.inlier].astype(float)
-        expected = reference.fit_ground_surface(inliers, case.plane, **options)
+        expected = reference.fit_ground_surface(inliers, case.plane, config)
         # A point on the edge of a cell may round into either: that moves the ground a little, round about.
         differ = np.abs(surface - expected)
         parity.assert_share(np.sum(differ > 2e-5), differ.size, 0.01, "surface")
@@ -101,9 +97,7 @@ def test_heights_are_those_of_the_reference_on_one_plane_and_on_two(cases):
     for case in cases:
         xyz = case.xyz.astype(float)
         for planes in (case.plane[None], np.stack([case.plane, case.plane + np.float32([0.01, 0, 0.8])])):
-            expected = reference.height_above_ground(
-                xyz, planes, case.surface, **parity.SURFACE_GRID, min_height_m=GROUND.min_height_m
-            )
+            expected = reference.height_above_ground(xyz, planes, case.surface, GROUND)
             height = height_above_ground(parity.pad(case.xyz, parity.CAPACITY), planes, case.surface, GROUND)
             differ = np.asarray(height)[: len(xyz)] - expected
             # 6e-5 on the border of the grid only: the compiled stage stops a thousandth of a cell short.

@@ -16,13 +16,7 @@ from jaxbox.stages.state import Obstacles
 from jaxbox.xla import backend
 
 SETTINGS = parity.CONFIG.vehicles
-AROUND = parity.select_options(SETTINGS, "margin_m", "ring_m", "upper_height_m", "top_quantile")
-SCORE = parity.select_options(
-    SETTINGS,
-    *("top_grade", "min_extent_m", "saturation_points", "sparseness_power", "free_scale", "ring_weight"),
-    *("overhead_weight", "support_points", "objective_gate", "objective_softness"),
-    *("recess_share", "upright_score"),
-)
+COUNTS = ("num_inside", "num_above", "num_ring", "num_upper", "num_recessed")
 MAX_BOXES = 1024
 NUM_RANDOM = 300
 
@@ -51,7 +45,7 @@ def boxes_of(case, rng):
 def counted_by_reference(cases):
     """Of each case: boxes, the heights of their classes, how far behind faces is recessed, and the counts."""
     rng = np.random.default_rng(0)
-    limits = parity.select_options(parity.CONFIG.ground, "min_height_m", "max_height_m")
+    car = SETTINGS.classes[0]
     class_tops = [vehicle.count_max_height_m for vehicle in SETTINGS.classes]
     rows = []
     for case in cases:
@@ -61,12 +55,9 @@ def counted_by_reference(cases):
         counts = [
             reference.count_points_around(
                 box,
-                case.obstacles.xyz,
-                case.obstacles.height,
-                **AROUND,
-                **limits,
-                count_max_height_m=float(top),
-                recess_m=float(recess_m),
+                dataclasses.replace(car, count_max_height_m=float(top), recess_m=float(recess_m)),
+                case.obstacles,
+                SETTINGS,
             )
             for box, top, recess_m in zip(boxes.astype(float), tops, recess, strict=True)
         ]
@@ -90,19 +81,10 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
         around = parity.on_host(around)
         wrong, seen, tops_m = 0, 0, []
         for row, expected in enumerate(counted):
-            theirs = np.array(
-                [expected.inside, expected.overhead, expected.ring, expected.upper, expected.recessed]
-            )
-            counts = (
-                around.num_inside,
-                around.num_above,
-                around.num_ring,
-                around.num_upper,
-                around.num_recessed,
-            )
-            ours = np.array([count[row] for count in counts])
+            theirs = np.array([getattr(expected, name) for name in COUNTS])
+            ours = np.array([getattr(around, name)[row] for name in COUNTS])
             wrong, seen = wrong + np.abs(ours - theirs).sum(), seen + theirs.sum()
-            tops_m.append((around.top[row], expected.top_m))
+            tops_m.append((around.top[row], expected.top))
         # A point on the edge of a box may round to either side of it.
         parity.assert_share(wrong, seen, 1e-4, "points round boxes")
         # A height on the edge of a level may round to either side of it.
@@ -148,18 +130,17 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
     expected = []
     for row in range(MAX_BOXES):
         around = (float(value[row]) for value in columns["around"])
-        one = {name: float(columns[name][row]) for name in ("objective", "hit", "free_length", "support")}
+        one = {name: float(columns[name][row]) for name in ("hit", "free_length", "support")}
         length, width = float(columns["length"][row]), float(columns["width"][row])
+        box = np.array([columns["rho"][row], 0.0, length, width, 0.0])
         expected.append(
             reference.score_box(
-                np.array([columns["rho"][row], 0.0, length, width, 0.0]),
+                reference.CompletedBox(box, float(columns["objective"][row]), length, width),
                 SETTINGS.classes[label[row]],
-                around=reference.PointsAround(*around),
-                measured_length_m=length,
-                measured_width_m=width,
-                num_members=int(columns["num_points"][row]),
+                around=reference.NeighbourhoodCounts(*around),
+                num_points=int(columns["num_points"][row]),
                 **one,
-                **SCORE,
+                config=SETTINGS,
             )
         )
     expected = np.array(expected)
@@ -188,7 +169,7 @@ def test_suppression_keeps_the_boxes_that_the_reference_keeps(cases):
         boxes = boxes_of(case, rng)
         scores = np.sort(rng.random(len(boxes)))[::-1]
         boxes = boxes[rng.permutation(len(boxes))]
-        kept = reference.suppress(boxes.astype(float), scores, max_overlap=SETTINGS.max_overlap)
+        kept = reference.non_max_suppression(boxes.astype(float), scores, max_overlap=SETTINGS.max_overlap)
         expected = np.isin(np.arange(len(boxes)), kept)
         keep = non_max_suppression(
             parity.pad(boxes, MAX_BOXES),
@@ -226,7 +207,7 @@ HEAPS = {
 def test_chains_and_heaps_of_boxes_are_suppressed_as_by_the_reference(heap, room):
     boxes = HEAPS[heap]
     scores = np.arange(len(boxes), 0, -1) / 100
-    kept = reference.suppress(boxes.astype(float), scores, max_overlap=SETTINGS.max_overlap)
+    kept = reference.non_max_suppression(boxes.astype(float), scores, max_overlap=SETTINGS.max_overlap)
     keep = non_max_suppression(
         parity.pad(boxes, room), parity.padded_mask(len(boxes), room), max_overlap=SETTINGS.max_overlap
     )

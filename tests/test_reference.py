@@ -1,76 +1,42 @@
 """Laws of the reference: each stage against a hand calculation, a brute-force loop or another library."""
 
 import dataclasses
+import functools
+import importlib
+import inspect
 import itertools
+import pathlib
+import pkgutil
+import re
 
 import cv2
 import numpy as np
 import pytest
 from scipy import sparse, spatial
 
-from jaxbox import reference
-from jaxbox.config import CompletionConfig, DetectorConfig, EvidenceConfig, GroundConfig, VehicleConfig
-from jaxbox.reference.vehicles import top_of
+from jaxbox import reference, stages
+from jaxbox.config import (
+    BoxConfig,
+    ClusteringConfig,
+    CompletionConfig,
+    ComponentMap,
+    DetectorConfig,
+    EvidenceConfig,
+    FilterConfig,
+    GroundConfig,
+    RegionConfig,
+    VehicleConfig,
+)
 from jaxbox.types import NUM_POINT_COUNTS, Counts, Label
 
 SENSOR_HEIGHT_M = 1.73
 CAR = VehicleConfig().classes[Label.CAR]
-
-
-def options(config, *names):
-    return {name: getattr(config, name) for name in names}
-
-
-FILTER = {
-    "half_x_m": 20.0,
-    "half_y_m": 20.0,
-    "cell_m": 1.0,
-    "num_levels": 8,
-    "num_iterations": 3,
-    "bandwidth_m": 1.0,
-    "num_std": 4.0,
-    "min_density": 1.1,
-}
-RANSAC = options(
-    GroundConfig(), "num_hypotheses", "num_refits", "tolerance_m", "max_slope_deg", "min_inlier_fraction"
-)
-SURFACE = {
-    "cell_m": 0.5,
-    "half_m": 80.0,
-    **options(
-        GroundConfig(),
-        *("num_envelope_rounds", "max_grade", "band_below_m", "band_below_grade", "band_above_m"),
-        *("band_above_grade", "blind_radius_m", "envelope_margin_m", "smoothing_m"),
-    ),
-}
-EVIDENCE = {
-    field.name: field.default for field in dataclasses.fields(EvidenceConfig) if field.name != "enabled"
-}
-COMPLETE = {
-    **options(CAR, "length_m", "width_m", "max_length_m", "max_width_m"),
-    **options(
-        CompletionConfig(),
-        *("num_rays", "free_weight", "free_length_weight", "inside_weight", "near_weight"),
-        *("closeness_weight", "not_away_cost", "seen_length", "seen_width", "seen_weight"),
-        *("length_margin_m", "width_margin_m"),
-    ),
-}
-SCORE = options(
-    VehicleConfig(),
-    *("top_grade", "min_extent_m", "saturation_points", "sparseness_power", "free_scale", "ring_weight"),
-    *("overhead_weight", "support_points", "objective_gate", "objective_softness"),
-    *("recess_share", "upright_score"),
-)
-AROUND = {
-    "margin_m": 0.1,
-    "ring_m": 0.5,
-    "min_height_m": 0.2,
-    "count_max_height_m": 2.0,
-    "max_height_m": 4.0,
-    "recess_m": 0.3,
-    "upper_height_m": 0.9,
-    "top_quantile": 0.0,
-}
+SQUARE = RegionConfig(half_x_m=20.0, half_y_m=20.0)
+FILTER = FilterConfig(num_std=4.0)
+GROUND, BOX, EVIDENCE = GroundConfig(), BoxConfig(), EvidenceConfig()
+COMPLETION, SCORE = CompletionConfig(), VehicleConfig()
+AROUND = VehicleConfig(margin_m=0.1, ring_m=0.5, upper_height_m=0.9, top_quantile=0.0)
+LOW_CAR = dataclasses.replace(CAR, count_max_height_m=2.0, recess_m=0.3)
 
 
 def turned(xy, yaw):
@@ -109,7 +75,7 @@ def lidar_sweep(boxes, *, noise_m=0.01, seed=0):
 
 def test_filter_keeps_dense_points_and_drops_the_lone_one():
     dense = np.random.default_rng(0).normal(0, 0.3, (200, 3))
-    inlier = reference.filter_outliers(np.vstack([dense, [[15.5, 15.5, 0.5]]]), **FILTER)
+    inlier = reference.filter_outliers(np.vstack([dense, [[15.5, 15.5, 0.5]]]), FILTER, SQUARE)
     assert inlier[:200].all()
     assert not inlier[200]
 
@@ -119,7 +85,9 @@ def test_window_weight_is_the_gaussian_of_the_cells_between(offset):
     pair = np.array([[0.5, 0.5, 0.5], np.array([0.5, 0.5, 0.5]) + offset])
     weight = 1 + np.exp(-0.5) ** sum(offset)
     for shift, expected in ((-1e-9, True), (1e-9, False)):
-        inlier = reference.filter_outliers(pair, **(FILTER | {"min_density": weight + shift, "num_std": 1e9}))
+        inlier = reference.filter_outliers(
+            pair, dataclasses.replace(FILTER, min_density=weight + shift, num_std=1e9), SQUARE
+        )
         assert inlier.tolist() == [expected, expected]
 
 
@@ -130,17 +98,19 @@ def test_one_mean_shift_step_reaches_the_centroid_of_the_window():
     distance = np.array([*[1.8 * w / (9 + w)] * 9, 1.8 * 9 * w / (9 * w + 1)])
     t = (distance[9] - distance.mean()) / distance.std()
     for shift, expected in ((1e-6, True), (-1e-6, False)):
-        changes = {"num_iterations": 1, "num_std": t + shift}
-        assert reference.filter_outliers(xyz, **(FILTER | changes))[9] == expected
+        config = dataclasses.replace(FILTER, num_iterations=1, num_std=t + shift)
+        assert reference.filter_outliers(xyz, config, SQUARE)[9] == expected
 
 
 def test_selection_counts_nan_as_not_finite_and_the_border_as_outside():
     xyz = np.array(
         [[0, 0, 0], [np.nan, 0, 0], [0, np.inf, 0], [80, 0, 0], [0, -59.9, 99], [0, 0, 1e30]], np.float32
     )
-    finite, valid = reference.select_points(xyz, half_x_m=80.0, half_y_m=60.0)
-    assert finite.tolist() == [True, False, False, True, True, True]
-    assert valid.tolist() == [True, False, False, False, True, False]
+    sweep = reference.select_points(xyz, FILTER, RegionConfig(half_x_m=80.0, half_y_m=60.0))
+    assert sweep.finite.tolist() == [True, False, False, True, True, True]
+    assert sweep.in_region.tolist() == [True, False, False, False, True, False]
+    # Points alone in their windows are outliers.
+    assert not sweep.inlier.any()
 
 
 # ---------------------------------------------------------------- ground
@@ -153,7 +123,7 @@ def test_ransac_recovers_a_tilted_plane_among_a_third_of_clutter(seed):
     xy = rng.uniform(-30, 30, (600, 2))
     z = xy @ truth[:2] + truth[2] + rng.normal(0, 0.02, 600)
     z[:200] += rng.uniform(0.5, 3, 200)
-    plane, found, count = reference.fit_ground_plane(np.column_stack([xy, z]), rng=rng, **RANSAC)
+    plane, found, count = reference.fit_ground_plane(np.column_stack([xy, z]), GROUND, rng=rng)
     assert found
     assert count == 400
     assert (np.abs(plane - truth) < [3e-4, 3e-4, 5e-3]).all()
@@ -164,7 +134,7 @@ def test_no_ground_is_found_on_a_slope_steeper_than_the_gate(slope):
     xy = np.random.default_rng(0).uniform(-5, 5, (300, 2))
     z = slope * xy[:, 0]
     plane, found, _ = reference.fit_ground_plane(
-        np.column_stack([xy, z]), rng=np.random.default_rng(0), **RANSAC
+        np.column_stack([xy, z]), GROUND, rng=np.random.default_rng(0)
     )
     assert not found
     np.testing.assert_array_equal(plane, [0, 0, z.min()])
@@ -173,7 +143,7 @@ def test_no_ground_is_found_on_a_slope_steeper_than_the_gate(slope):
 @pytest.mark.parametrize("points", [[], [[1, 2, -3]], [[1, 2, -3], [4, 5, 6]], [[1, 1, -3]] * 5])
 def test_too_few_or_repeated_candidates_give_a_level_plane_at_the_lowest(points):
     candidates = np.array(points, float).reshape(-1, 3)
-    plane, found, _ = reference.fit_ground_plane(candidates, rng=np.random.default_rng(0), **RANSAC)
+    plane, found, _ = reference.fit_ground_plane(candidates, GROUND, rng=np.random.default_rng(0))
     assert not found
     assert plane.tolist() == [0, 0, -3 if len(points) else 0]
 
@@ -182,12 +152,29 @@ def test_repeated_ransac_finds_both_levels_and_points_stand_on_the_one_below_the
     rng = np.random.default_rng(1)
     xy = rng.uniform(-20, 20, (500, 2))
     z = np.where(np.arange(500) < 300, -1.7, -0.7)
-    fits = reference.fit_ground_planes(np.column_stack([xy, z]), max_planes=3, rng=rng, **RANSAC)
+    config = dataclasses.replace(GROUND, max_planes=3)
+    fits = reference.fit_ground_planes(np.column_stack([xy, z]), config, rng=rng)
     planes = np.array([plane for plane, _, _ in fits])
     np.testing.assert_allclose(planes[:, 2], [-1.7, -0.7], atol=1e-9)
     probes = np.array([[0, 0, -1.0], [0, 0, -0.8], [0, 0, 0.5], [0, 0, -5]])
-    elevation = reference.plane_elevation(probes, planes, min_height_m=0.2)
+    elevation = reference.plane_elevation(probes, planes, tolerance_m=0.2)
     np.testing.assert_allclose(elevation, [-1.7, -0.7, -0.7, -1.7], atol=1e-9)
+    height = reference.height_above_planes(probes, planes, tolerance_m=0.2)
+    np.testing.assert_allclose(height, [0.7, -0.1, 1.2, -3.3], atol=1e-9)
+
+
+def test_obstacles_are_the_inliers_between_both_heights_in_order_up_to_the_capacity():
+    height = np.array([0.2, 0.21, np.nan, 4.5, 4.49, 1.0, 2.0])
+    xyz = np.column_stack([np.arange(7.0), np.zeros(7), height])
+    inlier = np.array([True, True, False, True, True, False, True])
+    sweep = reference.Sweep(xyz, np.ones(7, bool), np.ones(7, bool), inlier)
+    ground = reference.Ground(np.zeros((1, 3)), True, 9, None, height)
+    obstacles = reference.gather_obstacles(sweep, ground, DetectorConfig())
+    assert (obstacles.row.tolist(), obstacles.count) == ([1, 4, 6], 3)
+    clustering = dataclasses.replace(DetectorConfig().clustering, max_obstacles=2)
+    few = dataclasses.replace(DetectorConfig(), clustering=clustering)
+    obstacles = reference.gather_obstacles(sweep, ground, few)
+    assert (obstacles.row.tolist(), obstacles.count) == ([1, 4], 3)
 
 
 def test_cell_minima_match_a_loop_over_the_cells():
@@ -197,7 +184,7 @@ def test_cell_minima_match_a_loop_over_the_cells():
         cell = (np.floor(x) + 0.5, np.floor(y) + 0.5)
         lowest[cell] = min(z, lowest.get(cell, np.inf))
     expected = np.array([(*cell, z) for cell, z in sorted(lowest.items())])
-    np.testing.assert_allclose(reference.cell_minima(xyz, half_x_m=40, half_y_m=20), expected)
+    np.testing.assert_allclose(reference.cell_minima(xyz, GROUND), expected)
 
 
 def test_surface_of_a_flat_ground_is_the_plane_and_follows_a_gentle_rise():
@@ -207,8 +194,8 @@ def test_surface_of_a_flat_ground_is_the_plane_and_follows_a_gentle_rise():
     plane = np.array([0.01, 0.02, -1.7])
     for deviation, tolerance in ((np.zeros(len(xy)), 1e-9), (rise, 0.05)):
         xyz = np.column_stack([xy, xy @ plane[:2] + plane[2] + deviation])
-        grid = reference.fit_ground_surface(xyz, plane, **SURFACE)
-        height = reference.height_above_ground(xyz, plane, grid, cell_m=0.5, half_m=80.0)
+        grid = reference.fit_ground_surface(xyz, plane, GROUND)
+        height = reference.height_above_ground(xyz, plane, grid, GROUND)
         inner = (np.abs(xy) < 35).all(axis=1) & (np.hypot(*xy.T) > 5)
         assert np.abs(height[inner]).max() < tolerance
 
@@ -218,8 +205,8 @@ def test_envelope_keeps_a_steep_block_out_of_the_ground():
     block = (np.abs(xy - [12, 0]) < 1).all(axis=1)
     xyz = np.column_stack([xy, np.where(block, -0.9, -1.7)])
     plane = np.array([0.0, 0.0, -1.7])
-    grid = reference.fit_ground_surface(xyz, plane, **SURFACE)
-    height = reference.height_above_ground(xyz, plane, grid, cell_m=0.5, half_m=80.0)
+    grid = reference.fit_ground_surface(xyz, plane, GROUND)
+    height = reference.height_above_ground(xyz, plane, grid, GROUND)
     assert height[block].min() > 0.75
 
 
@@ -227,7 +214,9 @@ def test_surface_is_bilinear_between_cell_centres_and_constant_beyond_the_border
     centers = np.arange(8) - 3.5
     grid = 2 * centers[:, None] + 3 * centers[None, :]
     xy = np.array([[0.2, 0.9], [-3.5, 3.5], [100, -100]])
-    deviation = reference.surface_deviation(xy, grid, cell_m=1.0, half_m=4.0)
+    # The grid's squares are of 2 x 2 cells.
+    config = dataclasses.replace(GROUND, surface_cell_m=0.5, surface_half_m=4.0)
+    deviation = reference.surface_height(grid, xy, config)
     np.testing.assert_allclose(deviation, [3.1, 3.5, -3.5])
 
 
@@ -267,9 +256,8 @@ def test_algorithm_two_matches_the_components_of_the_radius_graph(seed):
 def test_points_linked_within_one_cell_edge_share_a_grid_component():
     xy = np.random.default_rng(0).uniform(-10, 10, (800, 2))
     cluster = reference.euclidean_clusters(xy, radius_m=0.5)
-    cells, shape = reference.grid_cells(
-        xy, np.zeros(800), cell_m=0.5, num_levels=1, half_x_m=10.0, half_y_m=10.0, min_height_m=0.2
-    )
+    region = RegionConfig(half_x_m=10.0, half_y_m=10.0)
+    cells, shape = reference.find_cells(xy, np.zeros(800), ComponentMap(cell_m=0.5), region)
     component = reference.label_components(cells, shape)
     assert cluster.max() > component.max() > 0
     for index in range(cluster.max() + 1):
@@ -278,9 +266,9 @@ def test_points_linked_within_one_cell_edge_share_a_grid_component():
 
 def test_levels_of_a_three_dimensional_map_part_what_is_stacked():
     xy, height = np.zeros((3, 2)), np.array([0.3, 0.7, 3.9])
-    grid = {"cell_m": 0.4, "half_x_m": 4.0, "half_y_m": 4.0, "min_height_m": 0.2}
-    flat, flat_shape = reference.grid_cells(xy, height, num_levels=1, **grid)
-    tall, tall_shape = reference.grid_cells(xy, height, num_levels=8, **grid)
+    region = RegionConfig(half_x_m=4.0, half_y_m=4.0)
+    flat, flat_shape = reference.find_cells(xy, height, ComponentMap(cell_m=0.4, num_levels=1), region)
+    tall, tall_shape = reference.find_cells(xy, height, ComponentMap(cell_m=0.4, num_levels=8), region)
     assert reference.label_components(flat, flat_shape).tolist() == [0, 0, 0]
     assert tall[:, 2].tolist() == [0, 1, 7]
     assert reference.label_components(tall, tall_shape).tolist() == [0, 0, 1]
@@ -289,23 +277,24 @@ def test_levels_of_a_three_dimensional_map_part_what_is_stacked():
 def test_warp_keeps_directions_and_near_points_and_grows_the_linking_distance_linearly():
     direction = np.array([np.cos(0.7), np.sin(0.7)])
     rho = np.array([0.0, 5.0, 20.0, 40.0, 70.0])
-    warped = reference.warp_range(rho[:, None] * direction, start_m=20.0, growth=0.02)
+    warped = reference.compress_range(rho[:, None] * direction, start_m=20.0, growth=0.02)
     np.testing.assert_allclose(warped[:3], rho[:3, None] * direction)
     np.testing.assert_allclose(np.arctan2(warped[1:, 1], warped[1:, 0]), 0.7)
     step = 1e-4
     near, far = (
-        np.hypot(*reference.warp_range((rho[3:] + s)[:, None] * direction, start_m=20.0, growth=0.02).T)
+        np.hypot(*reference.compress_range((rho[3:] + s)[:, None] * direction, start_m=20.0, growth=0.02).T)
         for s in (0, step)
     )
     np.testing.assert_allclose(step / (far - near), 1 + 0.02 * (rho[3:] - 20), rtol=1e-4)
-    assert reference.warp_range(warped, start_m=20.0, growth=0.0) is warped
+    assert reference.compress_range(warped, start_m=20.0, growth=0.0) is warped
 
 
 def test_size_gates_keep_their_limits_and_number_what_is_left_in_order():
     component = np.repeat([0, 1, 2, 3, 4], [3, 8, 8, 9, 8])
     xy = np.zeros((36, 2))
     xy[3, 1], xy[11, 0], xy[19], xy[28] = 12.0, 12.5, (0.6, 0.8), (0.6, 0.7)
-    slot, count = reference.keep_clusters(xy, component, min_points=8, min_extent_m=1.0, max_extent_m=12.0)
+    config = ClusteringConfig(min_points=8, max_extent_m=12.0)
+    slot, count = reference.select_clusters(xy, component, config, min_extent_m=1.0)
     assert count == 2
     assert slot.tolist() == [-1] * 3 + [0] * 8 + [-1] * 8 + [1] * 9 + [-1] * 8
 
@@ -318,7 +307,7 @@ def test_hull_is_counter_clockwise_and_that_of_qhull(seed):
     xy = np.random.default_rng(seed).normal(0, 3, (100, 2)).astype(np.float32)
     hull = reference.convex_hull(xy)
     expected = spatial.ConvexHull(xy)
-    assert reference.signed_area(hull) == pytest.approx(expected.volume)
+    assert reference.polygon_area(hull) == pytest.approx(expected.volume)
     assert {tuple(v) for v in hull.tolist()} == {
         tuple(v) for v in xy[expected.vertices].astype(float).tolist()
     }
@@ -349,7 +338,7 @@ def test_min_area_rectangle_recovers_a_turned_rectangle(yaw):
 @pytest.mark.parametrize("seed", range(5))
 def test_area_curve_reaches_rotating_calipers_within_the_bound_of_its_step(seed):
     xy = np.add(turned(np.random.default_rng(seed).uniform([-2, -1], [2, 1], (60, 2)), seed), [15, 4])
-    curve, extents = reference.criterion_curve(xy, criterion="area", num_angles=90, min_distance_m=0.05)
+    curve, extents = reference.try_rotations(xy, BoxConfig(criterion="area"))
     _, (length, width), _ = reference.min_area_rectangle(xy)
     half_step = np.radians(0.5)
     bound = (length + width * half_step) * (width + length * half_step)
@@ -374,7 +363,7 @@ def slow_criterion(xy, criterion, angle, min_distance):
 @pytest.mark.parametrize("criterion", ["variance", "closeness", "visible_closeness"])
 def test_criterion_curve_matches_a_loop_over_points_and_angles(criterion):
     xy = np.add(turned(np.random.default_rng(5).uniform([-2, -1], [2, 1], (40, 2)), 0.4), [-9, 6])
-    curve, _ = reference.criterion_curve(xy, criterion=criterion, num_angles=18, min_distance_m=0.05)
+    curve, _ = reference.try_rotations(xy, BoxConfig(criterion=criterion, num_angles=18))
     expected = [slow_criterion(xy, criterion, np.radians(5 * i), 0.05) for i in range(18)]
     np.testing.assert_allclose(curve, expected, atol=1e-12)
 
@@ -384,23 +373,24 @@ def test_every_criterion_finds_the_angle_of_a_corner_facing_the_sensor(criterion
     along = np.column_stack([np.linspace(0, 4, 41), np.zeros(41)])
     across = np.column_stack([np.zeros(17), np.linspace(0, 1.6, 17)])
     xy = np.add(turned(np.vstack([along, across]), np.radians(27)), [10, 8])
-    curve, _ = reference.criterion_curve(xy, criterion=criterion, num_angles=90, min_distance_m=0.05)
+    curve, _ = reference.try_rotations(xy, BoxConfig(criterion=criterion))
     assert np.argmax(curve) == 27
 
 
 def test_unknown_criterion_is_refused_by_name():
     with pytest.raises(ValueError, match="criterion is 'perimeter'; it must be area"):
-        reference.criterion_curve(np.ones((3, 2)), criterion="perimeter", num_angles=9, min_distance_m=0.1)
+        reference.try_rotations(np.ones((3, 2)), BoxConfig(criterion="perimeter"))
 
 
 def test_fit_points_are_the_slab_or_all_and_spread_evenly():
     members = np.arange(100, 120)
     height = np.zeros(200)
     height[104:] = 0.5
-    rule = {"min_height_m": 0.2, "max_height_m": 0.8, "min_slab_points": 5}
-    assert reference.fit_points(members, height, max_points=99, **rule).tolist() == list(range(104, 120))
-    assert reference.fit_points(members, height, max_points=5, **rule).tolist() == [104, 107, 110, 113, 116]
-    assert reference.fit_points(members[:8], height, max_points=99, **rule).tolist() == list(range(100, 108))
+    rule = functools.partial(BoxConfig, slab_min_height_m=0.2, slab_max_height_m=0.8, min_slab_points=5)
+    many, few = rule(max_points=99), rule(max_points=5)
+    assert reference.fit_points(members, height, many).tolist() == list(range(104, 120))
+    assert reference.fit_points(members, height, few).tolist() == [104, 107, 110, 113, 116]
+    assert reference.fit_points(members[:8], height, many).tolist() == list(range(100, 108))
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, 2.0])
@@ -419,7 +409,7 @@ def test_descriptors_of_a_filled_rectangle_are_those_of_the_textbook(yaw):
 
 def test_one_beam_to_the_ground_frees_the_cells_where_it_is_between_the_heights():
     xyz = np.array([[20.1, 0.0, -SENSOR_HEIGHT_M]])
-    evidence = reference.build_evidence(xyz, np.zeros(1), sensor_height_m=SENSOR_HEIGHT_M, **EVIDENCE)
+    evidence = reference.build_evidence(xyz, np.zeros(1), SENSOR_HEIGHT_M, EVIDENCE)
     free = np.diff(evidence.free_sums, axis=1) > 0
     start, end = (20.1 * (SENSOR_HEIGHT_M - h) / SENSOR_HEIGHT_M for h in (0.8, 0.35))
     wholly = [k for k in range(320) if k * 0.25 >= start and (k + 1) * 0.25 <= end]
@@ -431,7 +421,7 @@ def test_one_beam_to_the_ground_frees_the_cells_where_it_is_between_the_heights(
 
 def test_a_beam_that_ends_between_the_heights_is_free_up_to_the_gap_and_hits():
     xyz = np.array([[0.0, 12.6, -1.23]])
-    evidence = reference.build_evidence(xyz, np.array([0.5]), sensor_height_m=SENSOR_HEIGHT_M, **EVIDENCE)
+    evidence = reference.build_evidence(xyz, np.array([0.5]), SENSOR_HEIGHT_M, EVIDENCE)
     _, cells = np.nonzero(np.diff(evidence.free_sums, axis=1))
     assert cells.min() == int(12.6 * 0.93 / 1.23 / 0.25) + 1
     assert cells.max() == int((12.6 - 0.3) / 0.25) - 1
@@ -443,19 +433,19 @@ def wall_evidence():
     """A wall 10 m ahead, 4 m wide, with ground up to 40 m elsewhere."""
     xyz = lidar_sweep([(10.1, 0.0, 0.2, 4.0, 0.0, 3.0)], noise_m=0.0)
     height = xyz[:, 2] + SENSOR_HEIGHT_M
-    return reference.build_evidence(xyz, height, sensor_height_m=SENSOR_HEIGHT_M, **EVIDENCE)
+    return reference.build_evidence(xyz, height, SENSOR_HEIGHT_M, EVIDENCE)
 
 
 def test_boxes_at_before_and_behind_a_wall_and_in_the_open_are_hit_free_hidden_and_free():
     boxes = np.array([[11.0, 0, 2, 3, 0], [12.0, 12, 3, 2, 0.3], [25.0, 0, 3.9, 1.6, 0.2]])
-    rays = reference.box_evidence(boxes, wall_evidence(), num_rays=48)
+    rays = reference.cast_rays(wall_evidence(), boxes, num_rays=48)
     np.testing.assert_allclose(rays.hit, [1, 0, 0])
     # Rays over the corners of a box are too short to cover a whole range cell.
     assert rays.free[1] > 0.7
     np.testing.assert_allclose(rays.free + rays.occluded, [0, 1, 1])
     np.testing.assert_allclose(rays.free_length > 0.9, [False, True, False])
     assert rays.free_length[2] == 0
-    deep = reference.box_evidence(np.array([[8.5, 0, 4.0, 2.0, 0]]), wall_evidence(), num_rays=48)
+    deep = reference.cast_rays(wall_evidence(), np.array([[8.5, 0, 4.0, 2.0, 0]]), num_rays=48)
     assert deep.hit[0] == 0
     assert deep.free_length[0] > 0.4
 
@@ -469,10 +459,8 @@ def test_ray_shares_sum_to_one_and_a_mirrored_sweep_gives_mirrored_shares():
     shares = []
     for sign in (1, -1):
         height = xyz[:, 2] + SENSOR_HEIGHT_M
-        evidence = reference.build_evidence(
-            xyz * [1, sign, 1], height, sensor_height_m=SENSOR_HEIGHT_M, **EVIDENCE
-        )
-        rays = reference.box_evidence(boxes * [1, sign, 1, 1, sign], evidence, num_rays=33)
+        evidence = reference.build_evidence(xyz * [1, sign, 1], height, SENSOR_HEIGHT_M, EVIDENCE)
+        rays = reference.cast_rays(evidence, boxes * [1, sign, 1, 1, sign], num_rays=33)
         shares.append([rays.hit, rays.free, rays.occluded, rays.deep, rays.free_length])
     np.testing.assert_allclose(np.sum(shares[0][:4], axis=0), 1)
     # The middle ray of a box may fall on the border of two azimuth cells: one ray of 33.
@@ -490,27 +478,34 @@ def test_the_share_of_hit_rays_is_the_share_of_the_span_that_holds_returns():
     faces = [rho * np.array([np.cos(azimuth), np.sin(azimuth)]) for rho in np.arange(9.5, 14.5, 0.1)]
     xy = np.concatenate(faces, axis=1).T
     xyz = np.column_stack([xy, np.full(len(xy), 0.6)])
-    evidence = reference.build_evidence(xyz, xyz[:, 2], sensor_height_m=0.0, **EVIDENCE)
+    evidence = reference.build_evidence(xyz, xyz[:, 2], 0.0, EVIDENCE)
     share = (span.max() - middle) / np.ptp(span)
     assert abs(share - 0.5) > 0.02
-    rays = reference.box_evidence(box, evidence, num_rays=400)
+    rays = reference.cast_rays(evidence, box, num_rays=400)
     assert rays.hit[0] == pytest.approx(share, abs=0.015)
 
 
-def test_without_evidence_every_ray_counts_as_hit():
-    rays = reference.box_evidence(np.ones((3, 5)), None, num_rays=8)
-    assert rays.hit.tolist() == [1, 1, 1]
-    assert rays.free.tolist() == rays.free_length.tolist() == [0, 0, 0]
+def test_without_evidence_every_ray_counts_as_hit_and_the_ground_is_not_looked_at():
+    cluster = reference.Cluster(np.arange(50), 0.2, 1.5)
+    box = reference.CompletedBox(np.array([10.0, 0, 3.9, 1.63, 0]), np.inf, 3.9, 1.63)
+    completed = reference.Completed([reference.ClassHypothesis(0, Label.CAR)], [box], 1)
+    config = DetectorConfig.paper()
+    nothing = reference.index_obstacles(np.zeros((0, 3)), np.zeros(0), np.zeros(0, int))
+    (candidate,) = reference.score_boxes(completed, None, [cluster], nothing, config)
+    around = reference.cluster_alone(50, 1.5)
+    found = {"hit": 1.0, "free_length": 0.0, "support": None}
+    expected = reference.score_box(box, CAR, around=around, num_points=50, **found, config=config.vehicles)
+    assert candidate.score == expected > 0
 
 
 def test_ground_support_counts_the_seven_by_seven_cells_round_a_place():
     rng = np.random.default_rng(8)
     xyz = rng.uniform([-30, -30, -0.3], [30, 30, 0.3], (5000, 3))
-    evidence = reference.build_evidence(xyz, xyz[:, 2], sensor_height_m=SENSOR_HEIGHT_M, **EVIDENCE)
+    evidence = reference.build_evidence(xyz, xyz[:, 2], SENSOR_HEIGHT_M, EVIDENCE)
     for place in ([0.5, 0.5], [-12.3, 7.7], [29.0, -29.0]):
         low = np.floor(place) - 3
         inside = ((xyz[:, :2] >= low) & (xyz[:, :2] < low + 7)).all(axis=1) & (np.abs(xyz[:, 2]) < 0.15)
-        assert reference.support_at(np.array(place), evidence) == inside.sum()
+        assert reference.ground_support(evidence, np.array(place)) == inside.sum()
 
 
 # ---------------------------------------------------------------- completion
@@ -519,34 +514,43 @@ def test_ground_support_counts_the_seven_by_seven_cells_round_a_place():
 @pytest.mark.parametrize("sign", [1, -1])
 def test_extents_grow_away_from_the_sensor_towards_it_or_both_ways(sign):
     low, high = sorted((5.0 * sign, 7.0 * sign))
-    assert reference.complete_extent(low, high, 4.0, 0) == (7.0 * sign, 4.0)
-    assert reference.complete_extent(low, high, 4.0, 1) == (5.0 * sign, 4.0)
-    assert reference.complete_extent(low, high, 4.0, 2) == (6.0 * sign, 4.0)
-    assert reference.complete_extent(low, high, 1.0, 0) == (6.0 * sign, 2.0)
-    assert reference.complete_extent(5.0 * sign, 5.0 * sign, 4.0, 0) == (7.0 * sign, 4.0)
+    assert reference.extend((low, high), 4.0) == ((7.0 * sign, 5.0 * sign, 6.0 * sign), 4.0)
+    assert reference.extend((low, high), 1.0) == ((6.0 * sign,) * 3, 2.0)
+    (away, _, _), length = reference.extend((5.0 * sign, 5.0 * sign), 4.0)
+    assert (away, length) == (7.0 * sign, 4.0)
 
 
 def test_a_side_that_may_be_hidden_has_the_usual_size_and_one_seen_whole_nears_the_measured():
-    rule = {"margin_m": 0.3, "seen": 0.7, "seen_weight": 0.8}
-    sizes = [reference.likely_size(m, 4.0, **rule) for m in (0.0, 2.8, 3.0, 3.7, 5.0)]
+    prior = dataclasses.replace(CAR, length_m=4.0)
+    rule = dataclasses.replace(COMPLETION, length_margin_m=0.3, seen_length=0.7, seen_weight=0.8)
+
+    def likely_length(measured_m, config=rule):
+        sides = reference.Assignment((0.0, measured_m), (3.0, 4.0), 0.0)
+        return reference.likely_sizes(sides, prior, config)[0]
+
+    sizes = [likely_length(m) for m in (0.0, 2.8, 3.0, 3.7, 5.0)]
     np.testing.assert_allclose(sizes, [4, 4, 4 - 0.8 * 0.7, 4, 5.04])
     measured = np.linspace(0, 8, 50)
-    assert all(reference.likely_size(m, 4.0, **rule) >= m for m in measured)
-    unweighed = [reference.likely_size(m, 4.0, **(rule | {"seen_weight": 0.0})) for m in measured]
+    assert all(likely_length(m) >= m for m in measured)
+    unweighed = [likely_length(m, dataclasses.replace(rule, seen_weight=0.0)) for m in measured]
     np.testing.assert_allclose(unweighed, np.maximum(measured, 4))
 
 
-def complete(xy, *, mode, evidence=None, angle_deg=0):
-    curve, extents = reference.criterion_curve(
-        xy, criterion="visible_closeness", num_angles=90, min_distance_m=0.05
-    )
-    return reference.complete_box(
-        xy,
-        [reference.Reading(extents[angle_deg], np.radians(angle_deg), curve[angle_deg])],
-        evidence=evidence,
-        mode=mode,
-        **COMPLETE,
-    )
+def test_a_width_has_limits_of_its_own():
+    prior = dataclasses.replace(CAR, width_m=2.0)
+    rule = dataclasses.replace(COMPLETION, width_margin_m=0.1, seen_width=0.8, seen_weight=0.5)
+    widths = [
+        reference.likely_sizes(reference.Assignment((5.0, 6.0), (3.0, 3.0 + m), 0.0), prior, rule)[1]
+        for m in (1.6, 1.7, 2.4)
+    ]
+    np.testing.assert_allclose(widths, [2, 2 - 0.5 * 0.2, 2.4])
+
+
+def complete(xy, *, mode, evidence=None, angle_deg=0, prior=CAR, **changes):
+    curve, extents = reference.try_rotations(xy, BOX)
+    rectangle = reference.Rectangle(extents[angle_deg], np.radians(angle_deg), curve[angle_deg])
+    config = dataclasses.replace(COMPLETION, mode=mode, **changes)
+    return reference.complete_box(xy, [rectangle], prior, evidence, config)
 
 
 def test_away_keeps_the_visible_faces_and_extends_the_hidden_ones_to_the_prior():
@@ -567,13 +571,14 @@ def test_none_is_the_rectangle_as_measured_with_the_longer_side_as_length(long_a
 
 def test_a_cluster_larger_than_the_class_is_no_box():
     for mode in ("none", "away", "evidence"):
-        assert complete(np.array([[10.0, -4.0], [10.0, 4.0], [17.0, 0.0]]), mode=mode) is None
+        xy = np.array([[10.0, -4.0], [10.0, 4.0], [17.0, 0.0]])
+        assert complete(xy, mode=mode, evidence=wall_evidence()) is None
 
 
 def test_evidence_turns_a_rear_face_into_a_car_that_points_away_from_the_sensor():
     xyz = lidar_sweep([(14.0, 2.0, 3.9, 1.6, 0.0, 1.5)], noise_m=0.0)
     height = xyz[:, 2] + SENSOR_HEIGHT_M
-    evidence = reference.build_evidence(xyz, height, sensor_height_m=SENSOR_HEIGHT_M, **EVIDENCE)
+    evidence = reference.build_evidence(xyz, height, SENSOR_HEIGHT_M, EVIDENCE)
     rear = xyz[(height > 0.2) & (height < 0.8) & (np.abs(xyz[:, 0] - 12.05) < 0.02), :2]
     completed = complete(rear, mode="evidence", evidence=evidence)
     np.testing.assert_allclose(completed.box[:2], [14.0, 2.0], atol=0.1)
@@ -584,24 +589,17 @@ def test_evidence_turns_a_rear_face_into_a_car_that_points_away_from_the_sensor(
 def test_the_chosen_hypothesis_has_the_objective_that_its_parts_add_up_to():
     xyz = lidar_sweep([(14.0, 2.0, 3.9, 1.2, 0.4, 1.5), (9.0, 2.9, 0.3, 1.0, 0.0, 1.0)])
     height = xyz[:, 2] + SENSOR_HEIGHT_M
-    evidence = reference.build_evidence(xyz, height, sensor_height_m=SENSOR_HEIGHT_M, **EVIDENCE)
+    evidence = reference.build_evidence(xyz, height, SENSOR_HEIGHT_M, EVIDENCE)
     xy = xyz[(height > 0.2) & (height < 0.8) & (xyz[:, 0] > 10), :2]
-    curve, extents = reference.criterion_curve(
-        xy, criterion="visible_closeness", num_angles=90, min_distance_m=0.05
-    )
+    curve, _ = reference.try_rotations(xy, BOX)
     weights = {"free_weight": 0.7, "free_length_weight": 3.0, "inside_weight": 0.4, "near_weight": 0.9}
+    prior = dataclasses.replace(CAR, length_m=6.0, width_m=2.2)
     boxes = {}
     for cost in (-9.0, 9.0):
-        changes = weights | {"closeness_weight": 1.3, "not_away_cost": cost, "length_m": 6.0, "width_m": 2.2}
-        completed = reference.complete_box(
-            xy,
-            [reference.Reading(extents[23], np.radians(23), curve[23])],
-            evidence=evidence,
-            mode="evidence",
-            **(COMPLETE | changes),
-        )
-        rays = reference.box_evidence(completed.box[None], evidence, num_rays=COMPLETE["num_rays"])
-        inside, near = reference.point_agreement(completed.box[None], xy)
+        changes = weights | {"closeness_weight": 1.3, "not_away_cost": cost}
+        completed = complete(xy, mode="evidence", evidence=evidence, angle_deg=23, prior=prior, **changes)
+        rays = reference.cast_rays(evidence, completed.box[None], num_rays=COMPLETION.num_rays)
+        inside, near = agreement_parts(completed.box[None], xy)
         parts = (
             rays.hit - 0.7 * rays.free - 3 * rays.free_length + 0.4 * inside + 0.9 * near + 1.3 * curve[23]
         )
@@ -612,30 +610,45 @@ def test_the_chosen_hypothesis_has_the_objective_that_its_parts_add_up_to():
     assert np.hypot(*boxes[9.0][:2]) > np.hypot(*boxes[-9.0][:2]) + 0.05
 
 
+def agreement_parts(boxes, xy):
+    """Share of the points inside, and their mean closeness to the visible faces."""
+    weights = ({"inside_weight": 1.0, "near_weight": 0.0}, {"inside_weight": 0.0, "near_weight": 1.0})
+    return [reference.point_agreement(boxes, xy, dataclasses.replace(COMPLETION, **w)) for w in weights]
+
+
 def test_points_on_the_visible_faces_agree_fully_and_points_behind_agree_less():
     box = np.array([[10.0, 5.0, 4.0, 2.0, 0.0]])
     faces = np.array([[8.0, 4.5], [8.0, 5.5], [9.0, 4.0], [11.0, 4.0]])
-    inside, near = reference.point_agreement(box, faces)
+    inside, near = agreement_parts(box, faces)
     assert (inside[0], near[0]) == (1, 1)
-    inside, near = reference.point_agreement(box, np.array([[11.5, 5.5], [13.0, 9.0]]))
+    inside, near = agreement_parts(box, np.array([[11.5, 5.5], [13.0, 9.0]]))
     assert inside[0] == 0.5
     assert near[0] == pytest.approx(0.1 / 1.5 / 2)
 
 
 def test_scene_direction_is_the_heavier_vote_modulo_a_quarter_turn():
-    rules = {"num_angles": 90, "sigma_deg": 3.0, "min_extent_m": 2.2, "max_free": 0.15}
-    yaw = np.radians([20, 110, -70, 50, 51, 52])
-    extent, points = np.full(6, 4.0), np.full(6, 100)
+    config = BoxConfig(
+        direction_sigma_deg=3.0, direction_min_extent_m=2.2, direction_max_free=0.15, direction_weight=0.2
+    )
+
+    def vote(yaw_deg, extent, points, free):
+        voting = reference.may_vote(extent, free, config)
+        return reference.count_votes(np.radians(yaw_deg), extent, points, voting, config)
+
+    yaw_deg, extent, points = np.array([20, 110, -70, 50, 51, 52]), np.full(6, 4.0), np.full(6, 100)
     free = np.array([0, 0, 0, 0, 0.5, 0.5])
-    assert reference.scene_direction(yaw, extent, points, free, **rules) == 20
-    assert reference.scene_direction(yaw, extent, points * [1, 0, 0, 9, 1, 1], free, **rules) == 50
-    assert reference.scene_direction(yaw, extent * 0.5, points, free, **rules) is None
-    gain = reference.direction_preference(89.0, num_angles=90, weight=0.2, sigma_deg=3.0)
+    assert np.argmax(vote(yaw_deg, extent, points, free)) == 20
+    assert np.argmax(vote(yaw_deg, extent, points * [1, 0, 0, 9, 1, 1], free)) == 50
+    assert not vote(yaw_deg, extent * 0.5, points, free).any()
+    gain = vote(np.array([89]), np.full(1, 4.0), np.full(1, 100), np.zeros(1))
     np.testing.assert_allclose(gain[[89, 0, 86]], 0.2 * np.exp([0, -1 / 9, -1]))
-    assert not reference.direction_preference(None, num_angles=90, weight=0.2, sigma_deg=3.0).any()
 
 
 # ---------------------------------------------------------------- vehicles
+
+
+def obstacles_of(xyz, height):
+    return reference.index_obstacles(xyz, height, np.arange(len(xyz)))
 
 
 def test_points_round_a_box_are_shared_out_by_margin_ring_and_height():
@@ -643,9 +656,10 @@ def test_points_round_a_box_are_shared_out_by_margin_ring_and_height():
     xyz = np.array(
         [[10, 0, 0], [11.05, 0, 0], [11.2, 0, 0], [10, 2.4, 0], [11.6, 0, 0], [10, 0, 0], [10, 1, 0.0]]
     )
-    height = np.array([1.0, 1.4, 1.0, 0.5, 1.0, 2.5, 4.5])
-    around = reference.count_points_around(box, xyz, height, **AROUND)
-    assert (around.inside, around.top_m, around.overhead, around.ring) == (2, 1.4, 1, 2)
+    height = np.array([1.0, 1.4, 1.0, 0.5, 1.0, 2.5, 4.4])
+    around = reference.count_points_around(box, LOW_CAR, obstacles_of(xyz, height), AROUND)
+    # Those from 4.5 m on are not obstacles, see above.
+    assert (around.num_inside, around.top, around.num_above, around.num_ring) == (2, 1.4, 2, 2)
 
 
 def test_depth_is_behind_the_nearest_visible_face_and_endless_round_the_sensor():
@@ -661,36 +675,34 @@ def test_depth_is_behind_the_nearest_visible_face_and_endless_round_the_sensor()
 def test_upper_points_behind_the_faces_are_recessed():
     box = np.array([10.0, 0.0, 4.0, 2.0, 0.0])
     xyz = np.array([[8.0, 0, 0], [8.2, 0, 0], [8.4, 0, 0], [9.0, 0, 0], [9.0, 0, 0]])
-    around = reference.count_points_around(box, xyz, np.array([1.0, 1.0, 1.0, 1.4, 0.6]), **AROUND)
-    assert (around.upper, around.recessed) == (4, 2)
+    obstacles = obstacles_of(xyz, np.array([1.0, 1.0, 1.0, 1.4, 0.6]))
+    around = reference.count_points_around(box, LOW_CAR, obstacles, AROUND)
+    assert (around.num_upper, around.num_recessed) == (4, 2)
 
 
 def test_a_few_stray_returns_above_a_roof_are_not_its_top():
     roof = np.random.default_rng(0).uniform(0.3, 1.5, 400)
     options = {"max_height_m": 2.2, "top_quantile": 0.01}
     highest = options | {"top_quantile": 0.0}
-    assert top_of(roof, **highest) == roof.max()
-    clean = top_of(roof, **options)
+    assert reference.top_of(roof, **highest) == roof.max()
+    clean = reference.top_of(roof, **options)
     assert abs(clean - np.quantile(roof, 0.99)) < 0.02
     for num_stray in (1, 2, 4):
         with_strays = np.append(roof, np.linspace(1.8, 2.1, num_stray))
-        assert top_of(with_strays, **highest) == with_strays.max()
-        assert clean <= top_of(with_strays, **options) < roof.max() + 0.07
+        assert reference.top_of(with_strays, **highest) == with_strays.max()
+        assert clean <= reference.top_of(with_strays, **options) < roof.max() + 0.07
 
 
 def test_the_top_of_few_points_is_within_a_level_of_the_highest():
     for height in ([1.4], [0.5, 0.6], [0.3, 1.0, 1.41]):
-        top = top_of(np.array(height), 2.2, 0.01)
+        top = reference.top_of(np.array(height), 2.2, 0.01)
         assert max(height) - 0.6 * 2.2 / 20 < top <= max(height)
-    assert top_of(np.empty(0), 2.2, 0.01) == 0
+    assert reference.top_of(np.empty(0), 2.2, 0.01) == 0
 
 
 PERFECT = {
-    "around": reference.PointsAround(inside=100, top_m=1.5, overhead=0, ring=0),
-    "objective": np.inf,
-    "measured_length_m": 3.9,
-    "measured_width_m": 1.63,
-    "num_members": 100,
+    "around": reference.NeighbourhoodCounts(num_inside=100, top=1.5, num_above=0, num_ring=0),
+    "num_points": 100,
     "hit": 1.0,
     "free_length": 0.0,
     "support": 100.0,
@@ -698,33 +710,35 @@ PERFECT = {
 PERFECT_BOX = np.array([10.0, 0.0, 3.9, 1.63, 0.0])
 
 
-def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
-    def score(box=PERFECT_BOX, prior=CAR, **faults):
-        return reference.score_box(box, prior, **(PERFECT | faults), **SCORE)
+def score_of(box=PERFECT_BOX, prior=CAR, *, objective=np.inf, measured=(3.9, 1.63), **faults):
+    completed = reference.CompletedBox(box, objective, *measured)
+    return reference.score_box(completed, prior, **(PERFECT | faults), config=SCORE)
 
-    around = PERFECT["around"]
+
+def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
+    score, around = score_of, PERFECT["around"]
     assert score() == 1
     assert score(support=None) == 1
     assert score(moved(PERFECT_BOX, length=-0.8)) == pytest.approx(np.exp(-1))
     assert score(moved(PERFECT_BOX, length=2.0)) == pytest.approx(np.exp(-1))
     assert score(moved(PERFECT_BOX, width=0.3)) == pytest.approx(np.exp(-1))
-    assert score(num_members=50) == pytest.approx(0.5**0.3)
+    assert score(num_points=50) == pytest.approx(0.5**0.3)
     assert score(hit=0.25) == 0.25
     assert score(prior=dataclasses.replace(CAR, prior_weight=0.5)) == 0.5
     assert score(free_length=0.15) == pytest.approx(np.exp(-1))
     assert score(support=4.5) == pytest.approx(0.5)
     assert score(objective=2.4) == pytest.approx(0.5)
-    assert score(around=dataclasses.replace(around, ring=25)) == pytest.approx(np.exp(-2))
-    assert score(around=dataclasses.replace(around, overhead=50)) == pytest.approx(np.exp(-3))
-    assert score(around=dataclasses.replace(around, top_m=2.1)) == pytest.approx(np.exp(-1))
-    assert score(around=dataclasses.replace(around, upper=50, recessed=20)) == 1
-    assert score(around=dataclasses.replace(around, upper=50, recessed=10)) == pytest.approx(
+    assert score(around=dataclasses.replace(around, num_ring=25)) == pytest.approx(np.exp(-2))
+    assert score(around=dataclasses.replace(around, num_above=50)) == pytest.approx(np.exp(-3))
+    assert score(around=dataclasses.replace(around, top=2.1)) == pytest.approx(np.exp(-1))
+    assert score(around=dataclasses.replace(around, num_upper=50, num_recessed=20)) == 1
+    assert score(around=dataclasses.replace(around, num_upper=50, num_recessed=10)) == pytest.approx(
         0.2 + 0.8 * 12 / 55 / 0.4
     )
-    assert score(around=dataclasses.replace(around, upper=50)) == pytest.approx(0.2 + 0.8 * 2 / 55 / 0.4)
-    assert score(around=dataclasses.replace(around, upper=10**6)) == pytest.approx(0.2, abs=1e-4)
+    assert score(around=dataclasses.replace(around, num_upper=50)) == pytest.approx(0.2 + 0.8 * 2 / 55 / 0.4)
+    assert score(around=dataclasses.replace(around, num_upper=10**6)) == pytest.approx(0.2, abs=1e-4)
     # A top that reads low far away may be higher by the range allowance.
-    low = dataclasses.replace(around, top_m=1.2)
+    low = dataclasses.replace(around, top=1.2)
     assert score(around=low) == pytest.approx(np.exp(-((0.225 / 0.3) ** 2)))
     assert score(moved(PERFECT_BOX, x=30), around=low) == 1
 
@@ -732,13 +746,13 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
 @pytest.mark.parametrize(
     "fault",
     [
-        {"around": reference.PointsAround(inside=9, top_m=0.92, overhead=0, ring=0)},
-        {"around": reference.PointsAround(inside=9, top_m=2.3, overhead=0, ring=0)},
-        {"measured_length_m": 0.99, "measured_width_m": 0.99},
+        {"around": reference.cluster_alone(9, 0.92)},
+        {"around": reference.cluster_alone(9, 2.3)},
+        {"measured": (0.99, 0.99)},
     ],
 )
 def test_each_gate_closes(fault):
-    assert reference.score_box(PERFECT_BOX, CAR, **(PERFECT | fault), **SCORE) == 0
+    assert score_of(**fault) == 0
 
 
 def test_overlap_is_one_on_itself_symmetric_and_that_of_two_squares_at_45_degrees():
@@ -756,9 +770,9 @@ def test_suppression_keeps_the_best_of_each_group_in_order_of_score():
     box = np.array([10.0, 0.0, 4.0, 2.0, 0.1])
     boxes = np.array([box, moved(box, x=1), moved(box, x=20), moved(box, x=3.9)])
     scores = np.array([0.5, 0.7, 0.9, 0.1])
-    assert reference.suppress(boxes, scores, max_overlap=0.1).tolist() == [2, 1]
-    assert reference.suppress(boxes, scores, max_overlap=0.2).tolist() == [2, 1, 3]
-    assert reference.suppress(np.zeros((0, 5)), np.zeros(0), max_overlap=0.1).tolist() == []
+    assert reference.non_max_suppression(boxes, scores, max_overlap=0.1).tolist() == [2, 1]
+    assert reference.non_max_suppression(boxes, scores, max_overlap=0.2).tolist() == [2, 1, 3]
+    assert reference.non_max_suppression(np.zeros((0, 5)), np.zeros(0), max_overlap=0.1).tolist() == []
 
 
 # ---------------------------------------------------------------- detect
@@ -903,3 +917,51 @@ def test_components_of_a_real_sweep_hold_each_detection_in_one_piece(real_detect
     hull = detections.hulls[0].astype(np.float32)
     for point in xyz[best, :2]:
         assert cv2.pointPolygonTest(hull, point.tolist(), measureDist=True) > -1e-4
+
+
+# ---------------------------------------------------------------- twins
+
+NO_TWIN = {
+    "clustering.arrange_grids": "lays the cells of all maps in one row",
+    "clustering.find_statistics": "fills a table; select_clusters of the reference goes by the points",
+    "descriptors.point_moments": "sums over lists; shape_descriptors of the reference goes by the points",
+    "hull.extreme_points": "thins out what cannot reach the hull",
+    "hull.find_bounds": "the frame of those",
+    "hull.trace_hulls": "convex_hulls in chunks",
+    "hull.trace_owned": "convex_hulls of lists of points",
+    "rectangles.choose_rectangles": "best_rectangles in chunks",
+    "state.longest_side": "a property of Rectangle",
+    "state.prior_of": "looks up classes by arrays of labels",
+}
+"""Functions of the stages without a twin: what is about arrays of a fixed shape only."""
+
+
+def stage_functions():
+    for info in pkgutil.iter_modules(stages.__path__):
+        if not info.name.startswith("_"):
+            module = importlib.import_module(f"jaxbox.stages.{info.name}")
+            for name, item in vars(module).items():
+                if inspect.isfunction(item) and item.__module__ == module.__name__ and name[0] != "_":
+                    yield info.name, name
+
+
+def test_every_function_of_a_stage_has_a_twin_of_its_name_in_the_file_of_its_name():
+    functions = list(stage_functions())
+    assert len(functions) > 50
+    missing = set()
+    for module, name in functions:
+        twin = getattr(reference, name, None)
+        if twin is None or twin.__module__ != f"jaxbox.reference.{module}":
+            missing.add(f"{module}.{name}")
+    assert missing == set(NO_TWIN)
+
+
+def test_every_oracle_that_a_docstring_names_exists():
+    package = pathlib.Path(reference.__file__).parents[1]
+    named = {
+        name
+        for path in package.rglob("*.py")
+        for name in re.findall(r"`jaxbox\.reference\.(\w+)`", path.read_text())
+    }
+    assert len(named) > 10
+    assert {name for name in named if not hasattr(reference, name)} == set()

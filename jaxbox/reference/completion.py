@@ -1,304 +1,304 @@
-"""Correction for occluded vehicles: hypotheses for the sides out of sight, and the scene's direction."""
+"""Correction for occluded vehicles: hypotheses for the sides that are out of sight."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
-from jaxbox.reference.evidence import Evidence, box_evidence
+from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, Scalar, VehicleConfig
+from jaxbox.reference.evidence import cast_rays
+from jaxbox.reference.state import (
+    ClassHypothesis,
+    Cluster,
+    Completed,
+    CompletedBox,
+    Evidence,
+    RayFractions,
+    Rectangle,
+)
+from jaxbox.types import Label
 
-NEUTRAL_OBJECTIVE = np.inf
-"""Objective of a box that was not chosen among hypotheses: it passes every gate."""
+CERTAIN = np.inf
+"""Objective of a box that was not held against evidence: it passes every gate."""
 INSIDE_MARGIN_M = 0.1
 """A fitted point this far outside a hypothesis still counts as inside."""
 FACE_OVERHANG_M = 0.3
 """A face speaks for the points up to this beyond its ends."""
 NEAR_M = 0.1
 """Fitted points nearer to a visible face than this count as on it."""
-MAX_VOTE_POINTS = 150
-"""A cluster with more points has no more say about the scene's direction."""
-MAX_VOTE_EXTENT_M = 6.0
-"""A longer cluster has no more say about the scene's direction."""
-KEEP_NEAR, KEEP_FAR, KEEP_CENTRE = 0, 1, 2
-"""What stays where it was measured when an extent is completed."""
-
-
+AWAY, TOWARDS, BOTH = 0, 1, 2
+"""Placements: which way a completed side extends, as seen from the sensor."""
 SEEN_RAMP = 0.05
 """Share of the usual size over which a side goes from partly hidden to seen whole."""
+LOWER_PART_M = 0.5
+"""A cluster may be so much lower than its vehicle."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Reading:
-    """A cluster's rectangle at one rotation."""
-
-    extents: np.ndarray
-    """(4,) m: smallest and largest u, smallest and largest v (see `criterion_curve`)."""
-    angle: float
-    """rad, of the u axis."""
-    value: float
-    """Criterion of the rectangle, with the preference for the scene's direction."""
-
-
-@dataclasses.dataclass(frozen=True)
-class CompletedBox:
-    """A rectangle in the bird's-eye view, its hidden sides completed."""
-
-    box: np.ndarray
-    """(5,): x, y, length, width in m and yaw in rad, not wrapped."""
-    objective: float
-    """J, or `NEUTRAL_OBJECTIVE`."""
-    measured_length_m: float
-    """Extent of the fitted points along the box."""
-    measured_width_m: float
-    """Extent of the fitted points across the box."""
-
-
-def likely_size(
-    measured_m: float, usual_m: float, *, margin_m: float, seen: float, seen_weight: float
-) -> float:
-    """The usual size of a side that may be hidden in part; between it and the measured for the others.
-
-    Args:
-      measured_m: extent of the fitted points.
-      usual_m: of the class.
-      margin_m: measured sides read short by this.
-      seen: share of the usual size from which a side may be seen whole.
-      seen_weight: what the measured size of such a side weighs.
-
-    Returns:
-      m, at least as measured.
-
-    >>> likely_size(1.0, 4.0, margin_m=0.2, seen=0.7, seen_weight=0.5)
-    4.0
-    >>> likely_size(3.0, 4.0, margin_m=0.2, seen=0.7, seen_weight=0.5)
-    3.6
-    """
-    whole = np.clip((measured_m / usual_m - seen) / SEEN_RAMP, 0, 1)
-    return float(max(usual_m + seen_weight * whole * (measured_m + margin_m - usual_m), measured_m))
-
-
-def complete_extent(low: float, high: float, prior_m: float, keep: int) -> tuple[float, float]:
-    """Grows an interval to a length, if it is shorter.
-
-    Args:
-      low: m, coordinate along an axis through the sensor.
-      high: m.
-      prior_m: the length.
-      keep: `KEEP_NEAR` or `KEEP_FAR`, the end nearer to or farther from the sensor, or `KEEP_CENTRE`.
-
-    Returns:
-      Middle and length, m.
-
-    >>> complete_extent(5.0, 7.0, 4.0, KEEP_NEAR)
-    (7.0, 4.0)
-    """
-    length = max(prior_m, high - low)
-    if keep == KEEP_CENTRE:
-        return (low + high) / 2, length
-    # The nearer end is the lower one where the middle is positive, also for an interval of no length.
-    if (keep == KEEP_NEAR) == (low + high > 0):
-        return low + length / 2, length
-    return high - length / 2, length
-
-
-def complete_box(
-    xy: np.ndarray,
-    rectangles: list[Reading],
-    *,
+def complete_boxes(
+    candidates: Sequence[Sequence[Rectangle]],
+    outlines: Sequence[np.ndarray],
+    clusters: Sequence[Cluster],
     evidence: Evidence | None,
-    mode: str,
-    length_m: float,
-    width_m: float,
-    max_length_m: float,
-    max_width_m: float,
-    num_rays: int,
-    free_weight: float,
-    free_length_weight: float,
-    inside_weight: float,
-    near_weight: float,
-    closeness_weight: float,
-    not_away_cost: float,
-    seen_length: float,
-    seen_width: float,
-    seen_weight: float,
-    length_margin_m: float,
-    width_margin_m: float,
-) -> CompletedBox | None:
-    """Completes a rectangle round a cluster to the size of a vehicle class.
-
-    "evidence" tries each axis of each rectangle as the length, extended away from the sensor, with the
-    width extended away from it, towards it, or to both sides, and takes the largest objective
-    J = hit - free_weight free - free_length_weight free_length + inside_weight inside
-    + near_weight near + closeness_weight criterion - (not_away_cost unless the width extends away).
-    Boxes are judged at the class's size, and answered at their likely size (see `likely_size`).
-    "away" takes the longer extent of the first rectangle as the length and extends both away; "none"
-    changes nothing.
+    config: DetectorConfig,
+) -> Completed:
+    """The completed box of every class hypothesis that has one.
 
     Args:
-      xy: (n, 2) m, sensor frame: the fitted points.
-      rectangles: of the cluster, at one rotation or more.
+      candidates: rectangles of the clusters, one or two lists of them.
+      outlines: (n, 2) m, the points that those were fitted to.
+      clusters: of all maps.
       evidence: of the sweep, or None.
-      mode: "none", "away" or "evidence".
-      length_m: of the class.
-      width_m: of the class.
-      max_length_m: no such vehicle measures longer.
-      max_width_m: no such vehicle measures wider.
-      num_rays: rays a hypothesis.
-      free_weight: see above.
-      free_length_weight: see above.
-      inside_weight: see above.
-      near_weight: see above.
-      closeness_weight: see above.
-      not_away_cost: see above.
-      seen_length: see `likely_size`.
-      seen_width: see there.
-      seen_weight: see there.
-      length_margin_m: see there.
-      width_margin_m: see there.
+      config: of the detector.
 
     Returns:
-      The box, or None where the measured extents are too large for the class.
+      The hypotheses and their boxes.
     """
-    ways = [way for rectangle in rectangles for way in _ways(rectangle)]
-    if mode != "evidence":
-        ways = ways[:1] if ways[0].length >= ways[0].width else ways[1:2]
-    ways = [way for way in ways if way.length <= max_length_m and way.width <= max_width_m]
-    if not ways:
-        return None
-    if mode == "none":
-        return _completed(ways[0], _place(ways[0], 0.0, 0.0, KEEP_NEAR), NEUTRAL_OBJECTIVE)
-
-    def answer(way: _Way, keep: int, objective: float) -> CompletedBox:
-        length, width = _likely_sides(
-            way,
-            length_m=length_m,
-            width_m=width_m,
-            seen_length=seen_length,
-            seen_width=seen_width,
-            seen_weight=seen_weight,
-            length_margin_m=length_margin_m,
-            width_margin_m=width_margin_m,
-        )
-        return _completed(way, _place(way, length, width, keep), objective)
-
-    if mode == "away":
-        return answer(ways[0], KEEP_NEAR, NEUTRAL_OBJECTIVE)
-    trials = [(way, keep) for way in ways for keep in (KEEP_NEAR, KEEP_FAR, KEEP_CENTRE)]
-    boxes = np.array([_place(way, length_m, width_m, keep) for way, keep in trials])
-    rays = box_evidence(boxes, evidence, num_rays=num_rays)
-    inside, near = point_agreement(boxes, xy)
-    objective = rays.hit - free_weight * rays.free - free_length_weight * rays.free_length
-    objective += inside_weight * inside + near_weight * near
-    objective += closeness_weight * np.array([way.value for way, _ in trials])
-    objective -= not_away_cost * np.array([keep != KEEP_NEAR for _, keep in trials])
-    best = int(np.argmax(objective))
-    return answer(*trials[best], float(objective[best]))
+    hypotheses, boxes, num_assignments = [], [], 0
+    for hypothesis in list_hypotheses(clusters, candidates[0], config.vehicles):
+        prior = config.vehicles.classes[hypothesis.label]
+        rectangles = [each[hypothesis.cluster] for each in candidates]
+        if config.completion.mode == "evidence":
+            num_assignments += count_assignments(rectangles, prior)
+        box = complete_box(outlines[hypothesis.cluster], rectangles, prior, evidence, config.completion)
+        if box is not None:
+            hypotheses.append(hypothesis)
+            boxes.append(box)
+    return Completed(hypotheses, boxes, num_assignments)
 
 
-def count_assignments(rectangles: list[Reading], max_length_m: float, max_width_m: float) -> int:
+def list_hypotheses(
+    clusters: Sequence[Cluster], rectangles: Sequence[Rectangle], config: VehicleConfig
+) -> list[ClassHypothesis]:
+    """Lists the first class of all clusters, then each other class of the large ones.
+
+    Args:
+      clusters: of all maps.
+      rectangles: of the clusters.
+      config: the classes, and what large clusters are.
+
+    Returns:
+      The hypotheses, but for clusters that are too low for any class.
+    """
+    every = list(range(len(clusters)))
+    large = [row for row in every if is_large(clusters[row], config)][: config.max_large]
+    return [
+        ClassHypothesis(row, label)
+        for label in Label
+        for row in (large if label else every)
+        if _may_be_high_enough(clusters[row], rectangles[row], config)
+    ]
+
+
+def is_large(cluster: Cluster, config: VehicleConfig) -> bool:
+    """Whether a cluster is tried as other classes than the first: high, and standing on the ground.
+
+    Args:
+      cluster: of any map.
+      config: how high, from where on, and of how many points.
+
+    Returns:
+      True for those.
+    """
+    stands = cluster.bottom_m < config.large_clearance_m
+    enough = len(cluster.members) >= config.large_min_points
+    return bool(stands and enough and cluster.top_m > config.large_height_m)
+
+
+def _may_be_high_enough(cluster: Cluster, rectangle: Rectangle, config: VehicleConfig) -> bool:
+    """Whether a cluster can be (the lower part of) a vehicle of the lowest class."""
+    u0, u1, v0, v1 = rectangle.extents
+    allowance = config.top_grade * np.hypot((u0 + u1) / 2, (v0 + v1) / 2)
+    lowest = min(float(prior.min_height_m) for prior in config.classes)
+    return bool(cluster.top_m + allowance > lowest - LOWER_PART_M)
+
+
+def count_assignments(rectangles: Sequence[Rectangle], prior: ClassPrior) -> int:
     """Sides of the rectangles that may be the length of a class; those at one rotation count once.
 
     Args:
       rectangles: of a cluster.
-      max_length_m: no such vehicle measures longer.
-      max_width_m: no such vehicle measures wider.
+      prior: of the class.
 
     Returns:
       None to two a rectangle.
     """
-    ways = [way for r in {r.angle: r for r in rectangles}.values() for way in _ways(r)]
-    return sum(way.length <= max_length_m and way.width <= max_width_m for way in ways)
+    distinct = {rectangle.angle: rectangle for rectangle in rectangles}.values()
+    return sum(fits(assign_length_axis(rectangle, side), prior) for rectangle in distinct for side in (0, 1))
 
 
-def boxes_away(
-    rectangle: Reading, *, max_length_m: float, max_width_m: float, **sides: float
-) -> list[CompletedBox]:
-    """The boxes with either side as length, completed away from the sensor.
+def complete_box(
+    xy: np.ndarray,
+    rectangles: Sequence[Rectangle],
+    prior: ClassPrior,
+    evidence: Evidence | None,
+    config: CompletionConfig,
+) -> CompletedBox | None:
+    """Completes a rectangle round a cluster to the size of a vehicle class.
+
+    "evidence" tries each side of each rectangle as the length, extended away from the sensor, with the
+    width extended away from it, towards it, or both ways, and takes the largest objective (see
+    `choose_placement`). Boxes are judged at the class's size, and answered at their likely size (see
+    `likely_sizes`). "away" takes the longer side of the first rectangle as the length and extends both
+    away; "none" changes nothing.
 
     Args:
-      rectangle: of the cluster.
-      max_length_m: no such vehicle measures longer.
-      max_width_m: no such vehicle measures wider.
-      **sides: length_m, width_m, seen_length, seen_width, seen_weight, length_margin_m and width_margin_m,
-        see `complete_box`.
+      xy: (n, 2) m, sensor frame: the fitted points.
+      rectangles: of the cluster, at one rotation or more.
+      prior: of the class.
+      evidence: of the sweep; None only where the mode is another.
+      config: the mode and its weights.
 
     Returns:
-      Those that the class allows: none to two.
+      The box, or None where the measured sides are too long for the class.
     """
-    ways = [way for way in _ways(rectangle) if way.length <= max_length_m and way.width <= max_width_m]
-    return [
-        _completed(way, _place(way, *_likely_sides(way, **sides), KEEP_NEAR), NEUTRAL_OBJECTIVE)
-        for way in ways
-    ]
+    if config.mode != "evidence":
+        sides = longer_side(rectangles[0])
+        return keep_measured(sides, prior) if config.mode == "none" else extend_away(sides, prior, config)
+    assert evidence is not None
+    best: CompletedBox | None = None
+    for rectangle in rectangles:
+        for sides in (assign_length_axis(rectangle, side) for side in (0, 1)):
+            if not fits(sides, prior):
+                continue
+            boxes = place_widths(sides, prior)
+            rays = cast_rays(evidence, boxes, num_rays=config.num_rays)
+            agreement = point_agreement(boxes, xy, config)
+            placement, objective = choose_placement(rectangle.score, agreement, rays, config)
+            if best is None or objective > best.objective:
+                best = place(sides, likely_sizes(sides, prior, config), placement, objective)
+    return best
 
 
 @dataclasses.dataclass(frozen=True)
-class _Way:
-    """A rectangle with one of its axes as the length."""
+class Assignment:
+    """A rectangle with one of its sides taken as the length."""
 
     along: tuple[float, float]
+    """m: where the length begins and ends, along the box and from the sensor."""
     across: tuple[float, float]
+    """m: the same of the width, across the box."""
     yaw: float
-    value: float
+    """rad, not wrapped."""
 
     @property
-    def length(self) -> float:
-        return self.along[1] - self.along[0]
-
-    @property
-    def width(self) -> float:
-        return self.across[1] - self.across[0]
+    def measured(self) -> tuple[float, float]:
+        """m: length and width."""
+        return self.along[1] - self.along[0], self.across[1] - self.across[0]
 
 
-def _ways(rectangle: Reading) -> list[_Way]:
+def assign_length_axis(rectangle: Rectangle, side: int) -> Assignment:
+    """Takes one side of a rectangle as its length: 0 that along u, 1 that along v."""
     u0, u1, v0, v1 = rectangle.extents
+    if side == 0:
+        return Assignment((u0, u1), (v0, v1), rectangle.angle)
     # Turning the axes by a quarter turn takes (u, v) to (v, -u).
-    return [
-        _Way((u0, u1), (v0, v1), rectangle.angle, rectangle.value),
-        _Way((v0, v1), (-u1, -u0), rectangle.angle + np.pi / 2, rectangle.value),
-    ]
+    return Assignment((v0, v1), (-u1, -u0), rectangle.angle + np.pi / 2)
 
 
-def _likely_sides(
-    way: _Way,
-    *,
-    length_m: float,
-    width_m: float,
-    seen_length: float,
-    seen_width: float,
-    seen_weight: float,
-    length_margin_m: float,
-    width_margin_m: float,
-) -> tuple[float, float]:
+def longer_side(rectangle: Rectangle) -> Assignment:
+    """The assignment with the longer side as length."""
+    along_u, along_v = rectangle.sides_m
+    return assign_length_axis(rectangle, int(along_v > along_u))
+
+
+def fits(sides: Assignment, prior: ClassPrior) -> bool:
+    """Whether the measured sides are no longer than those of the class."""
+    length, width = sides.measured
+    return bool(length <= prior.max_length_m and width <= prior.max_width_m)
+
+
+def keep_measured(sides: Assignment, prior: ClassPrior) -> CompletedBox | None:
+    """The rectangle as measured (the paper); None where it is too large for the class."""
+    return place(sides, sides.measured, AWAY, CERTAIN) if fits(sides, prior) else None
+
+
+def extend_away(sides: Assignment, prior: ClassPrior, config: CompletionConfig) -> CompletedBox | None:
+    """Both sides completed away from the sensor to their likely sizes; None where they are too long."""
+    return place(sides, likely_sizes(sides, prior, config), AWAY, CERTAIN) if fits(sides, prior) else None
+
+
+def likely_sizes(sides: Assignment, prior: ClassPrior, config: CompletionConfig) -> tuple[float, float]:
+    """The class's size for sides that may be hidden in part; between it and the measured for the others.
+
+    Args:
+      sides: as measured.
+      prior: of the class.
+      config: from which share of the class's size on a side may be seen whole, what its measured size
+        weighs then, and by how much measured sides read short.
+
+    Returns:
+      Length and width, m, at least as measured.
+    """
+
+    def likely(measured_m: float, usual_m: Scalar, seen: Scalar, margin_m: Scalar) -> float:
+        whole = np.clip((measured_m / usual_m - seen) / SEEN_RAMP, 0, 1)
+        return float(
+            max(usual_m + config.seen_weight * whole * (measured_m + margin_m - usual_m), measured_m)
+        )
+
+    length, width = sides.measured
     return (
-        likely_size(
-            way.length, length_m, margin_m=length_margin_m, seen=seen_length, seen_weight=seen_weight
-        ),
-        likely_size(way.width, width_m, margin_m=width_margin_m, seen=seen_width, seen_weight=seen_weight),
+        likely(length, prior.length_m, config.seen_length, config.length_margin_m),
+        likely(width, prior.width_m, config.seen_width, config.width_margin_m),
     )
 
 
-def _place(way: _Way, length_m: float, width_m: float, keep_width: int) -> np.ndarray:
-    """(5,) box grown to a size."""
-    along, length = complete_extent(*way.along, length_m, KEEP_NEAR)
-    across, width = complete_extent(*way.across, width_m, keep_width)
-    cos, sin = np.cos(way.yaw), np.sin(way.yaw)
-    return np.array([cos * along - sin * across, sin * along + cos * across, length, width, way.yaw])
+def extend(side: tuple[float, float], size_m: float) -> tuple[tuple[float, float, float], float]:
+    """Grows an interval to a size, if it is shorter: away from the sensor, towards it, and both ways.
+
+    Args:
+      side: m, along an axis through the sensor.
+      size_m: the size.
+
+    Returns:
+      The three middles, in the order of the placements, and the size, m.
+
+    >>> extend((5.0, 7.0), 4.0)
+    ((7.0, 5.0, 6.0), 4.0)
+    """
+    low, high = side
+    size_m = max(size_m, high - low)
+    from_low, from_high = low + size_m / 2, high - size_m / 2
+    # The nearer end is the lower one where the middle is positive, also for an interval of no length.
+    away, towards = (from_low, from_high) if low + high > 0 else (from_high, from_low)
+    return (away, towards, (low + high) / 2), size_m
 
 
-def _completed(way: _Way, box: np.ndarray, objective: float) -> CompletedBox:
-    return CompletedBox(box, objective, way.length, way.width)
+def place(sides: Assignment, sizes: tuple[float, float], placement: int, objective: float) -> CompletedBox:
+    """A box of a size: the length away from the sensor, the width where the placement says."""
+    (along, _, _), length = extend(sides.along, sizes[0])
+    middles, width = extend(sides.across, sizes[1])
+    cos, sin = np.cos(sides.yaw), np.sin(sides.yaw)
+    across = middles[placement]
+    box = np.array([cos * along - sin * across, sin * along + cos * across, length, width, sides.yaw])
+    return CompletedBox(box, objective, *sides.measured)
 
 
-def point_agreement(boxes: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How well points agree with boxes: share inside, and mean closeness to the visible faces.
+def place_widths(sides: Assignment, prior: ClassPrior) -> np.ndarray:
+    """Completes boxes to the class's size, or the measured where that is larger.
+
+    Args:
+      sides: as measured.
+      prior: of the class.
+
+    Returns:
+      (3, 5) boxes, one a placement; the length is completed away from the sensor.
+    """
+    sizes = float(prior.length_m), float(prior.width_m)
+    return np.array([place(sides, sizes, placement, CERTAIN).box for placement in (AWAY, TOWARDS, BOTH)])
+
+
+def point_agreement(boxes: np.ndarray, xy: np.ndarray, config: CompletionConfig) -> np.ndarray:
+    """How well boxes hold the points they were made from, and how close these are to visible faces.
 
     Args:
       boxes: (B, 5): x, y, length, width in m and yaw in rad.
       xy: (n, 2) m, sensor frame, n >= 1.
+      config: weights of the share of the points within the box and its margin, and of the mean of
+        .1 / max(d, .1), d the distance to the nearest visible face.
 
     Returns:
-      (B,) share of the points within the box and its margin, and (B,) mean of
-      .1 / max(distance to the nearest visible face, .1); both in [0, 1].
+      (B,) weighted sum of both.
     """
     inside, near = np.zeros(len(boxes)), np.zeros(len(boxes))
     for row, (x, y, length, width, yaw) in enumerate(boxes):
@@ -314,64 +314,27 @@ def point_agreement(boxes: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.n
                 to_face = np.where(beside, np.abs(local[:, axis] - face), np.inf)
                 distance = np.minimum(distance, to_face)
         near[row] = np.mean(NEAR_M / np.maximum(distance, NEAR_M))
-    return inside, near
+    return float(config.inside_weight) * inside + float(config.near_weight) * near
 
 
-def scene_direction(
-    yaw: np.ndarray,
-    extent_m: np.ndarray,
-    num_points: np.ndarray,
-    free_length: np.ndarray,
-    *,
-    num_angles: int,
-    sigma_deg: float,
-    min_extent_m: float,
-    max_free: float,
-) -> float | None:
-    """The direction modulo 90 degrees that most boxes of the sweep share, by a weighted vote.
+def choose_placement(
+    score: float, agreement: np.ndarray, rays: RayFractions, config: CompletionConfig
+) -> tuple[int, float]:
+    """The placement of an assignment that explains the evidence best.
+
+    J = hit - wf free - wl free_length + agreement + wc score - cost [width not away].
 
     Args:
-      yaw: (k,) rad.
-      extent_m: (k,) longer measured extent.
-      num_points: (k,) members of the cluster.
-      free_length: (k,) share of the box seen to be free.
-      num_angles: directions that are voted on: i 90 / num_angles degrees.
-      sigma_deg: a vote for d weighs exp(-(d / sigma)^2) at distance d.
-      min_extent_m: boxes with a shorter extent do not vote.
-      max_free: boxes with a larger share do not vote.
+      score: of the rectangle.
+      agreement: (3,), see `point_agreement`.
+      rays: (3,) fractions.
+      config: wf, wl, wc and the cost.
 
     Returns:
-      Degrees in [0, 90), or None without voters.
+      The placement, the first of equally good ones, and its J.
     """
-    votes = (extent_m >= min_extent_m) & (free_length <= max_free)
-    if not votes.any():
-        return None
-    weight = np.minimum(num_points[votes], MAX_VOTE_POINTS) * np.minimum(extent_m[votes], MAX_VOTE_EXTENT_M)
-    angles = np.arange(num_angles) * 90 / num_angles
-    distance = _turn_between_deg(angles[:, None], np.degrees(yaw[votes]))
-    return float(angles[np.argmax(np.exp(-((distance / sigma_deg) ** 2)) @ weight)])
-
-
-def direction_preference(
-    direction_deg: float | None, *, num_angles: int, weight: float, sigma_deg: float
-) -> np.ndarray:
-    """What each rotation of a rectangle gains for lying along the scene's direction.
-
-    Args:
-      direction_deg: from `scene_direction`; None gives zeros.
-      num_angles: A, rotations over 90 degrees.
-      weight: gain on the direction itself.
-      sigma_deg: width of the preference.
-
-    Returns:
-      (A,) weight exp(-(d / sigma)^2).
-    """
-    if direction_deg is None:
-        return np.zeros(num_angles)
-    distance = _turn_between_deg(np.arange(num_angles) * 90 / num_angles, direction_deg)
-    return weight * np.exp(-((distance / sigma_deg) ** 2))
-
-
-def _turn_between_deg(first: np.ndarray, second: np.ndarray | float) -> np.ndarray:
-    """Signed turn between axes of rectangles, modulo 90 degrees, in [-45, 45)."""
-    return (first - second + 45) % 90 - 45
+    objective = rays.hit - config.free_weight * rays.free - config.free_length_weight * rays.free_length
+    objective = objective + agreement + config.closeness_weight * score
+    objective = objective - config.not_away_cost * np.array([0, 1, 1])
+    placement = int(np.argmax(objective))
+    return placement, float(objective[placement])

@@ -1,9 +1,10 @@
 """What each beam says about a box: hit, seen through (free) or hidden."""
 
-import dataclasses
-
 import numpy as np
 from scipy import ndimage
+
+from jaxbox.config import EvidenceConfig
+from jaxbox.reference.state import Evidence, Ground, RayFractions, Sweep
 
 SUPPORT_HALF_M = 100
 """The ground support grid covers |x|, |y| below this in cells of 1 m."""
@@ -29,51 +30,25 @@ FREE_BEFORE_M = 0.2
 """up to this far before the exit."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Evidence:
-    """Hits and free space on a polar grid, and ground points on a square one."""
+def observe(sweep: Sweep, ground: Ground, config: EvidenceConfig) -> Evidence | None:
+    """What the beams saw.
 
-    hit_sums: np.ndarray
-    """(azimuths, ranges + 1) int: returns between the hit heights in all range cells before."""
-    free_sums: np.ndarray
-    """(azimuths, ranges + 1) int: free range cells before."""
-    support: np.ndarray
-    """(200, 200) int: ground points in the 7 x 7 cells of 1 m round each."""
-    range_cell_m: float
-    """Length of a range cell."""
+    Args:
+      sweep: of n points.
+      ground: below them.
+      config: of the evidence.
 
-
-@dataclasses.dataclass(frozen=True)
-class BoxEvidence:
-    """Shares of the rays over each of B boxes; the first four sum to 1, or to 0 without rays."""
-
-    hit: np.ndarray
-    """(B,): end at the faces towards the sensor."""
-    free: np.ndarray
-    """(B,): pass through."""
-    occluded: np.ndarray
-    """(B,): tell nothing."""
-    deep: np.ndarray
-    """(B,): end inside, behind the faces."""
-    free_length: np.ndarray
-    """(B,): length seen to be free over length within the box, all rays together."""
+    Returns:
+      The evidence; None where the preset does not ask for it.
+    """
+    if not config.enabled:
+        return None
+    sensor_height_m = -float(ground.planes[0, 2])
+    return build_evidence(sweep.xyz[sweep.inlier], ground.height[sweep.inlier], sensor_height_m, config)
 
 
 def build_evidence(
-    xyz: np.ndarray,
-    height: np.ndarray,
-    *,
-    sensor_height_m: float,
-    num_azimuths: int,
-    num_ranges: int,
-    range_cell_m: float,
-    min_range_m: float,
-    hit_min_height_m: float,
-    hit_max_height_m: float,
-    free_min_height_m: float,
-    free_max_height_m: float,
-    end_gap_m: float,
-    support_height_m: float,
+    xyz: np.ndarray, height: np.ndarray, sensor_height_m: float, config: EvidenceConfig
 ) -> Evidence:
     """Collects what the beams hit and what they passed through.
 
@@ -84,38 +59,24 @@ def build_evidence(
       xyz: (n, 3) finite, m, sensor frame: all returns, ground included.
       height: (n,) m above the ground.
       sensor_height_m: height of the sensor above the ground.
-      num_azimuths: azimuth cells all round, from -pi.
-      num_ranges: range cells.
-      range_cell_m: length of a range cell.
-      min_range_m: nearer returns are left out.
-      hit_min_height_m: returns between these heights are hits,
-      hit_max_height_m: exclusive.
-      free_min_height_m: beams between these heights show free space.
-      free_max_height_m: see there.
-      end_gap_m: a beam that ends between them shows it up to this before its return.
-      support_height_m: points within this of the ground support it, exclusive.
+      config: the grid, and the heights, all exclusive, of what is a hit, free, or support.
 
     Returns:
       The evidence.
     """
-    support = ground_support(xyz, height, support_height_m=support_height_m)
+    support = _count_support(xyz, height, config)
+    num_azimuths, num_ranges, range_cell_m = config.num_azimuths, config.num_ranges, config.range_cell_m
     rho = np.hypot(xyz[:, 0], xyz[:, 1])
-    far = rho >= min_range_m
+    far = rho >= config.min_range_m
     xyz, height, rho = xyz[far], height[far], rho[far]
     azimuth = azimuth_cell(np.arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths)
 
     hits = np.zeros((num_azimuths, num_ranges + 1), int)
-    hit = (height > hit_min_height_m) & (height < hit_max_height_m) & (rho < num_ranges * range_cell_m)
+    hit = (height > config.hit_min_height_m) & (height < config.hit_max_height_m)
+    hit &= rho < num_ranges * range_cell_m
     np.add.at(hits, (azimuth[hit], (rho[hit] / range_cell_m).astype(int)), 1)
 
-    start, end = _free_interval(
-        rho,
-        height,
-        sensor_height_m=sensor_height_m,
-        lowest_m=free_min_height_m,
-        highest_m=free_max_height_m,
-        end_gap_m=end_gap_m,
-    )
+    start, end = _free_interval(rho, height, sensor_height_m, config)
     # Only cells that lie wholly within the interval are free.
     first = np.minimum((start / range_cell_m).astype(int) + 1, num_ranges)
     last = np.minimum((end / range_cell_m).astype(int), num_ranges)
@@ -141,36 +102,22 @@ def _sums_before(cells: np.ndarray) -> np.ndarray:
 
 
 def _free_interval(
-    rho: np.ndarray,
-    height: np.ndarray,
-    *,
-    sensor_height_m: float,
-    lowest_m: float,
-    highest_m: float,
-    end_gap_m: float,
+    rho: np.ndarray, height: np.ndarray, sensor_height_m: float, config: EvidenceConfig
 ) -> tuple[np.ndarray, np.ndarray]:
     """Ranges between which each beam is within the heights; empty for beams that do not fall."""
     descent = height - sensor_height_m
     falls = descent < -MIN_DESCENT_M
     descent = np.where(falls, descent, -1.0)
-    enters = np.maximum((highest_m - sensor_height_m) / descent, 0.0)
-    leaves = np.minimum((lowest_m - sensor_height_m) / descent, 1.0)
-    end = rho * leaves - np.where(leaves >= FULL_BEAM, end_gap_m, 0.0)
+    enters = np.maximum((config.free_max_height_m - sensor_height_m) / descent, 0.0)
+    leaves = np.minimum((config.free_min_height_m - sensor_height_m) / descent, 1.0)
+    end = rho * leaves - np.where(leaves >= FULL_BEAM, config.end_gap_m, 0.0)
     return np.where(falls, rho * enters, 0.0), np.where(falls, end, 0.0)
 
 
-def ground_support(xyz: np.ndarray, height: np.ndarray, *, support_height_m: float) -> np.ndarray:
-    """Ground points in the window round each cell of 1 m.
-
-    Args:
-      xyz: (n, 3) finite, m, sensor frame.
-      height: (n,) m above the ground.
-      support_height_m: ground points are within this of the ground, exclusive.
-
-    Returns:
-      (200, 200) int.
-    """
-    ground = (np.abs(height) < support_height_m) & (np.abs(xyz[:, :2]) < SUPPORT_HALF_M).all(axis=1)
+def _count_support(xyz: np.ndarray, height: np.ndarray, config: EvidenceConfig) -> np.ndarray:
+    """(200, 200) int: ground points in the window round each cell of 1 m."""
+    ground = np.abs(height) < config.support_height_m
+    ground &= (np.abs(xyz[:, :2]) < SUPPORT_HALF_M).all(axis=1)
     cell = np.floor(xyz[ground, :2] + SUPPORT_HALF_M).astype(int)
     counts = np.zeros((2 * SUPPORT_HALF_M, 2 * SUPPORT_HALF_M), int)
     np.add.at(counts, tuple(cell.T), 1)
@@ -180,34 +127,45 @@ def ground_support(xyz: np.ndarray, height: np.ndarray, *, support_height_m: flo
     return counts
 
 
-def support_at(xy: np.ndarray, evidence: Evidence) -> int:
-    """Ground points in the window round a place.
+def ground_support(evidence: Evidence, xy: np.ndarray) -> np.ndarray:
+    """Ground points in the 7 x 7 cells of 1 m round a place.
 
     Args:
-      xy: (2,) m; beyond the grid its border holds.
       evidence: of the sweep.
+      xy: (..., 2) m; beyond the grid its border holds.
 
     Returns:
-      The number.
+      (...) int.
     """
-    x, y = np.clip(np.floor(xy + SUPPORT_HALF_M), 0, 2 * SUPPORT_HALF_M - 1).astype(int)
-    return int(evidence.support[x, y])
+    cell = np.clip(np.floor(xy + SUPPORT_HALF_M), 0, 2 * SUPPORT_HALF_M - 1).astype(int)
+    return evidence.support[cell[..., 0], cell[..., 1]]
 
 
-def box_evidence(boxes: np.ndarray, evidence: Evidence | None, *, num_rays: int) -> BoxEvidence:
-    """Sends rays over each box, evenly over the azimuths that it spans, and asks the evidence.
+def weigh_boxes(evidence: Evidence, boxes: np.ndarray, *, num_rays: int) -> tuple[RayFractions, np.ndarray]:
+    """What the rays over each box met, and the ground support round it.
 
     Args:
+      evidence: of the sweep.
       boxes: (B, 5): x, y, length, width in m and yaw in rad.
-      evidence: of the sweep; None counts every ray as hit.
       num_rays: rays a box.
 
     Returns:
-      The shares.
+      The fractions, and (B,) int, see `ground_support`.
     """
-    if evidence is None:
-        one, zero = np.ones(len(boxes)), np.zeros(len(boxes))
-        return BoxEvidence(one, zero, zero, zero, zero)
+    return cast_rays(evidence, boxes, num_rays=num_rays), ground_support(evidence, boxes[:, :2])
+
+
+def cast_rays(evidence: Evidence, boxes: np.ndarray, *, num_rays: int) -> RayFractions:
+    """Sends rays over each box, evenly over the azimuths that it spans, and asks the evidence.
+
+    Args:
+      evidence: of the sweep.
+      boxes: (B, 5): x, y, length, width in m and yaw in rad.
+      num_rays: rays a box.
+
+    Returns:
+      The fractions.
+    """
     angle = _ray_angles(boxes, num_rays)
     entry, exit_ = _intersect(boxes, angle)
     counted = (exit_ > entry) & (entry >= MIN_ENTRY_M)
@@ -233,7 +191,7 @@ def box_evidence(boxes: np.ndarray, evidence: Evidence | None, *, num_rays: int)
     through = counted & ~hit & (free > 0)
     deep = counted & ~hit & ~through & (all_hits > 0)
     total = np.maximum(counted.sum(axis=1), 1)
-    return BoxEvidence(
+    return RayFractions(
         hit=hit.sum(axis=1) / total,
         free=through.sum(axis=1) / total,
         occluded=(counted & ~hit & ~through & ~deep).sum(axis=1) / total,

@@ -3,39 +3,34 @@
 import numpy as np
 from scipy import ndimage
 
+from jaxbox.config import FilterConfig, RegionConfig
+from jaxbox.reference.state import Sweep
+
 MAX_ABS_Z_M = 100.0
 """No road or vehicle in range of the sensor is so far above or below it."""
 
 
-def select_points(xyz: np.ndarray, *, half_x_m: float, half_y_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Tells which points are finite, and which of those lie within the region.
+def select_points(xyz: np.ndarray, config: FilterConfig, region: RegionConfig) -> Sweep:
+    """Picks the finite points in the region, and those of them that are no outliers.
 
     Args:
       xyz: (n, 3) m, sensor frame; NaN and infinity allowed.
-      half_x_m: the region is |x| below this.
-      half_y_m: the region is |y| below this, and |z| below 100 m.
+      config: of the filter.
+      region: |x| and |y| below its halves; |z| is below 100 m.
 
     Returns:
-      finite (n,) bool and valid (n,) bool, the finite points within the region.
+      The points, and what each of them is.
     """
     finite = np.isfinite(xyz).all(axis=1).astype(bool)
-    within = (np.abs(xyz[:, 0]) < half_x_m) & (np.abs(xyz[:, 1]) < half_y_m)
-    within &= np.abs(xyz[:, 2]) < MAX_ABS_Z_M
-    return finite, finite & within
+    within = (np.abs(xyz[:, 0]) < region.half_x_m) & (np.abs(xyz[:, 1]) < region.half_y_m)
+    in_region = finite & within & (np.abs(xyz[:, 2]) < MAX_ABS_Z_M)
+    inlier = in_region.copy()
+    if config.enabled:
+        inlier[in_region] = filter_outliers(xyz[in_region], config, region)
+    return Sweep(xyz, finite, in_region, inlier)
 
 
-def filter_outliers(
-    xyz: np.ndarray,
-    *,
-    half_x_m: float,
-    half_y_m: float,
-    cell_m: float,
-    num_levels: int,
-    num_iterations: int,
-    bandwidth_m: float,
-    num_std: float,
-    min_density: float,
-) -> np.ndarray:
+def filter_outliers(xyz: np.ndarray, config: FilterConfig, region: RegionConfig) -> np.ndarray:
     """Mean shift on a grid; points far from their converged centroid, or alone, are outliers.
 
     The window of a point is its cell and the 26 cells around, weighted (w, 1, w) along each axis
@@ -45,20 +40,17 @@ def filter_outliers(
 
     Args:
       xyz: (n, 3) finite, m, sensor frame, within the region.
-      half_x_m: the grid covers |x| below this.
-      half_y_m: the grid covers |y| below this.
-      cell_m: edge of the cells.
-      num_levels: cells in height, centred on z = 0; points beyond join the end levels.
-      num_iterations: steps of the mean shift, at least 1.
-      bandwidth_m: standard deviation of the window.
-      num_std: t of the paper.
-      min_density: least weight in the window; a point alone in it weighs 1.
+      config: t of the paper is `num_std`; the grid's levels in height are centred on z = 0, and points
+        beyond join the end levels.
+      region: that the grid covers.
 
     Returns:
       (n,) bool, True for inliers.
     """
     if len(xyz) == 0:
         return np.zeros(0, bool)
+    cell_m, num_levels = config.cell_m, config.num_levels
+    half_x_m, half_y_m = region.half_x_m, region.half_y_m
     shape = np.array([round(2 * half_x_m / cell_m), round(2 * half_y_m / cell_m), num_levels])
     half = np.array([half_x_m, half_y_m, num_levels * cell_m / 2])
 
@@ -67,16 +59,15 @@ def filter_outliers(
         return tuple(index.T)
 
     xyz = xyz.astype(np.float64)
-    centroid, density = _window_means(
-        xyz, cell_of(xyz), tuple(shape), np.exp(-0.5 * (cell_m / bandwidth_m) ** 2)
-    )
+    side_weight = float(np.exp(-0.5 * (cell_m / config.bandwidth_m) ** 2))
+    centroid, density = _window_means(xyz, cell_of(xyz), tuple(shape), side_weight)
     mode = centroid[cell_of(xyz)]
-    for _ in range(num_iterations - 1):
+    for _ in range(config.num_iterations - 1):
         mode = centroid[cell_of(mode)]
     distance = np.linalg.norm(xyz - mode, axis=1)
-    inlier = density[cell_of(xyz)] >= min_density
+    inlier = density[cell_of(xyz)] >= config.min_density
     if inlier.any():
-        inlier &= distance <= distance[inlier].mean() + num_std * distance[inlier].std()
+        inlier &= distance <= distance[inlier].mean() + config.num_std * distance[inlier].std()
     return inlier
 
 

@@ -2,6 +2,11 @@
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import KDTree
+
+from jaxbox.config import DetectorConfig, GroundConfig
+from jaxbox.config.schema import GROUND_CANDIDATE_CELL_M
+from jaxbox.reference.state import Ground, Obstacles, Sweep
 
 DIAGONAL_STEP = np.sqrt(2)
 """Diagonal neighbours are this many cells away."""
@@ -21,20 +26,78 @@ MIN_PLANE_POINTS = 3
 """A plane has three degrees of freedom."""
 
 
-def cell_minima(xyz: np.ndarray, *, half_x_m: float, half_y_m: float, cell_m: float = 1.0) -> np.ndarray:
-    """Lowest point of each occupied cell: the candidates for the ground.
+def remove_ground(sweep: Sweep, config: GroundConfig, rng: np.random.Generator) -> Ground:
+    """Fits the ground, and measures the height of every inlier above it.
+
+    Args:
+      sweep: of n points.
+      config: of the ground.
+      rng: source of the samples of RANSAC.
+
+    Returns:
+      The ground and the heights.
+    """
+    xyz, inlier = sweep.xyz, sweep.inlier
+    if config.candidates == "cell_minima":
+        candidates = cell_minima(xyz[inlier], config)
+    else:
+        candidates = spread_points(xyz, inlier, config)
+    fits = fit_ground_planes(candidates, config, rng=rng)
+    planes = np.array([plane for plane, _, _ in fits])
+    surface = fit_ground_surface(xyz[inlier], planes, config) if config.surface else None
+    height = np.full(len(xyz), np.nan)
+    height[inlier] = height_above_ground(xyz[inlier], planes, surface, config)
+    return Ground(planes, fits[0][1], fits[0][2], surface, height)
+
+
+def gather_obstacles(sweep: Sweep, ground: Ground, config: DetectorConfig) -> Obstacles:
+    """Picks the points between the ground and the height of the tallest vehicle.
+
+    Args:
+      sweep: of n points.
+      ground: below them.
+      config: of the detector: the heights, both exclusive, and how many points at most.
+
+    Returns:
+      The points, in sweep order.
+    """
+    # NaN, the height of points that are left out, is not between.
+    between = (ground.height > config.ground.min_height_m) & (ground.height < config.ground.max_height_m)
+    rows = np.flatnonzero(sweep.inlier & between)
+    return index_obstacles(sweep.xyz, ground.height, rows, max_obstacles=config.clustering.max_obstacles)
+
+
+def index_obstacles(
+    xyz: np.ndarray, height: np.ndarray, rows: np.ndarray, *, max_obstacles: int | None = None
+) -> Obstacles:
+    """Gathers points and indexes them by place.
+
+    Args:
+      xyz: (n, 3) m, the sweep.
+      height: (n,) m above the ground.
+      rows: (m,) int, the obstacles among them.
+      max_obstacles: only the first of them are taken, as many as this; None takes all.
+
+    Returns:
+      The obstacles.
+    """
+    taken = rows[:max_obstacles]
+    tree = KDTree(xyz[taken, :2]) if len(taken) else None
+    return Obstacles(taken, xyz[taken], height[taken], len(rows), tree)
+
+
+def cell_minima(xyz: np.ndarray, config: GroundConfig) -> np.ndarray:
+    """Lowest point of each occupied cell of 1 m: the candidates for the ground.
 
     Args:
       xyz: (n, 3) finite, m, sensor frame.
-      half_x_m: cells cover |x| below this.
-      half_y_m: cells cover |y| below this.
-      cell_m: edge of the cells.
+      config: how far the cells reach.
 
     Returns:
       (m, 3) m: x and y of the cell's centre, and its lowest z; cells in row-major order.
     """
-    xyz = xyz[(np.abs(xyz[:, 0]) < half_x_m) & (np.abs(xyz[:, 1]) < half_y_m)].astype(np.float64)
-    half = np.array([half_x_m, half_y_m])
+    half, cell_m = np.array([config.candidate_half_x_m, config.candidate_half_y_m]), GROUND_CANDIDATE_CELL_M
+    xyz = xyz[(np.abs(xyz[:, :2]) < half).all(axis=1)].astype(np.float64)
     index = np.floor((xyz[:, :2] + half) / cell_m).astype(int)
     shape = np.ceil(2 * half / cell_m).astype(int) + 1
     lowest = np.full(shape, np.inf)
@@ -44,41 +107,31 @@ def cell_minima(xyz: np.ndarray, *, half_x_m: float, half_y_m: float, cell_m: fl
     return np.column_stack([center, lowest[row, column]])
 
 
-def spread_candidates(xyz: np.ndarray, inlier: np.ndarray, *, num_candidates: int) -> np.ndarray:
-    """Inliers among points spread evenly over the sweep.
+def spread_points(xyz: np.ndarray, inlier: np.ndarray, config: GroundConfig) -> np.ndarray:
+    """Inliers among points spread evenly over the sweep: the paper's candidates for the ground.
 
     Args:
       xyz: (n, 3) m, the whole sweep.
       inlier: (n,) bool.
-      num_candidates: rows looked at: floor(j n / num_candidates).
+      config: rows looked at are floor(j n / num_candidates).
 
     Returns:
       (m, 3) m, m <= num_candidates; rows repeat where n is smaller.
     """
-    rows = np.arange(num_candidates) * len(xyz) // num_candidates if len(xyz) else np.zeros(0, int)
+    num = config.num_candidates
+    rows = np.arange(num) * len(xyz) // num if len(xyz) else np.zeros(0, int)
     return xyz[rows[inlier[rows]]].astype(np.float64)
 
 
 def fit_ground_plane(
-    candidates: np.ndarray,
-    *,
-    rng: np.random.Generator,
-    num_hypotheses: int,
-    num_refits: int,
-    tolerance_m: float,
-    max_slope_deg: float,
-    min_inlier_fraction: float,
+    candidates: np.ndarray, config: GroundConfig, *, rng: np.random.Generator
 ) -> tuple[np.ndarray, bool, int]:
     """The plane z = a x + b y + c with the most candidates within the tolerance (RANSAC).
 
     Args:
       candidates: (m, 3) m.
+      config: samples, refits on the inliers, the tolerance, which is exclusive, and the gates.
       rng: source of the samples of three.
-      num_hypotheses: samples drawn.
-      num_refits: least-squares refits of the best plane on its inliers.
-      tolerance_m: vertical distance of an inlier, exclusive.
-      max_slope_deg: steeper planes are not considered.
-      min_inlier_fraction: share of the candidates that the plane must hold.
 
     Returns:
       (a, b, c), whether such a plane was found, and its number of inliers. Where none was found
@@ -87,10 +140,11 @@ def fit_ground_plane(
     Reference:
       Fischler and Bolles 1981; paper, Algorithm I.
     """
-    max_slope = np.tan(np.radians(max_slope_deg))
+    tolerance_m = float(config.tolerance_m)
+    max_slope = np.tan(np.radians(config.max_slope_deg))
     level = np.array([0.0, 0.0, candidates[:, 2].min() if len(candidates) else 0.0])
     best, best_support = None, -1
-    for _ in range(num_hypotheses if len(candidates) else 0):
+    for _ in range(config.num_hypotheses if len(candidates) else 0):
         plane = _plane_through(candidates[rng.integers(0, len(candidates), 3)])
         if plane is None or np.hypot(plane[0], plane[1]) > max_slope:
             continue
@@ -99,10 +153,10 @@ def fit_ground_plane(
             best, best_support = plane, support
     if best is None:
         return level, False, int(_inliers(candidates, level, tolerance_m).sum())
-    for _ in range(num_refits):
+    for _ in range(config.num_refits):
         best = _refit(candidates[_inliers(candidates, best, tolerance_m)], best)
     num_inliers = int(_inliers(candidates, best, tolerance_m).sum())
-    enough = num_inliers >= max(MIN_PLANE_POINTS, min_inlier_fraction * len(candidates))
+    enough = num_inliers >= max(MIN_PLANE_POINTS, config.min_inlier_fraction * len(candidates))
     if not enough or np.hypot(best[0], best[1]) > max_slope:
         return level, False, int(_inliers(candidates, level, tolerance_m).sum())
     return best, True, num_inliers
@@ -132,61 +186,53 @@ def _refit(points: np.ndarray, plane: np.ndarray) -> np.ndarray:
 
 
 def fit_ground_planes(
-    candidates: np.ndarray, *, max_planes: int, tolerance_m: float, **options
+    candidates: np.ndarray, config: GroundConfig, *, rng: np.random.Generator
 ) -> list[tuple[np.ndarray, bool, int]]:
     """Repeats `fit_ground_plane` on the candidates that no plane holds yet (Algorithm I, "repeat").
 
     Args:
       candidates: (m, 3) m.
-      max_planes: rounds, at least 1.
-      tolerance_m: as in `fit_ground_plane`.
-      **options: as in `fit_ground_plane`.
+      config: as in `fit_ground_plane`; at most `max_planes` rounds.
+      rng: source of the samples.
 
     Returns:
       The first plane, found or not, and each further plane that was found.
     """
-    fits = [fit_ground_plane(candidates, tolerance_m=tolerance_m, **options)]
-    while fits[-1][1] and len(fits) < max_planes:
-        candidates = candidates[~_inliers(candidates, fits[-1][0], tolerance_m)]
-        fits.append(fit_ground_plane(candidates, tolerance_m=tolerance_m, **options))
+    fits = [fit_ground_plane(candidates, config, rng=rng)]
+    while fits[-1][1] and len(fits) < config.max_planes:
+        candidates = candidates[~_inliers(candidates, fits[-1][0], float(config.tolerance_m))]
+        fits.append(fit_ground_plane(candidates, config, rng=rng))
     return fits[:1] + [fit for fit in fits[1:] if fit[1]]
 
 
-def plane_elevation(xyz: np.ndarray, coefficients: np.ndarray, *, min_height_m: float = 0.0) -> np.ndarray:
-    """z of the plane under each point: the highest that is at most min_height_m above it.
+def height_above_planes(xyz: np.ndarray, planes: np.ndarray, *, tolerance_m: float = 0.0) -> np.ndarray:
+    """Height of points over the plane under each; the arguments are those of `plane_elevation`.
+
+    Returns:
+      (n,) m.
+    """
+    return xyz[:, 2] - plane_elevation(xyz, planes, tolerance_m=tolerance_m)
+
+
+def plane_elevation(xyz: np.ndarray, planes: np.ndarray, *, tolerance_m: float = 0.0) -> np.ndarray:
+    """z of the plane under each point: the highest that is at most the tolerance above it.
 
     Args:
       xyz: (n, 3) m.
-      coefficients: (3,) or (planes, 3).
-      min_height_m: slack for points of the ground itself; of no effect with one plane.
+      planes: (3,) or (planes, 3).
+      tolerance_m: slack for points of the ground itself; of no effect with one plane.
 
     Returns:
       (n,) m. Below all planes it is the lowest of them.
     """
-    planes = np.atleast_2d(coefficients)
+    planes = np.atleast_2d(planes)
     elevation = planes[:, :2] @ xyz[:, :2].T + planes[:, 2:]
-    under = elevation <= xyz[:, 2] + min_height_m
+    under = elevation <= xyz[:, 2] + tolerance_m
     highest = np.where(under, elevation, -np.inf).max(axis=0)
     return np.where(under.any(axis=0), highest, elevation.min(axis=0))
 
 
-def fit_ground_surface(
-    xyz: np.ndarray,
-    coefficients: np.ndarray,
-    *,
-    cell_m: float,
-    half_m: float,
-    num_envelope_rounds: int,
-    max_grade: float,
-    band_below_m: float,
-    band_below_grade: float,
-    band_above_m: float,
-    band_above_grade: float,
-    blind_radius_m: float,
-    envelope_margin_m: float,
-    smoothing_m: float,
-    min_height_m: float = 0.0,
-) -> np.ndarray:
+def fit_ground_surface(xyz: np.ndarray, planes: np.ndarray, config: GroundConfig) -> np.ndarray:
     """Deviation of the ground from the plane on a grid.
 
     Cell minima of the points near the plane, kept where they are within the margin of their lower
@@ -195,35 +241,27 @@ def fit_ground_surface(
 
     Args:
       xyz: (n, 3) finite, m, sensor frame.
-      coefficients: (3,) or (planes, 3).
-      cell_m: edge of the grid's cells.
-      half_m: the grid covers |x|, |y| below this.
-      num_envelope_rounds: cells over which the slope limit spreads.
-      max_grade: steepest slope of the envelope, m/m.
-      band_below_m: points lower than this below the plane, plus the grade times the range, are no ground.
-      band_below_grade: see there.
-      band_above_m: points higher than this above the plane, plus the grade times the range, are no ground.
-      band_above_grade: see there.
-      blind_radius_m: nearer points are no ground.
-      envelope_margin_m: highest ground above the envelope, exclusive.
-      smoothing_m: standard deviation of the Gaussian.
-      min_height_m: as in `plane_elevation`.
+      planes: (3,) or (planes, 3).
+      config: the grid, the band round the plane, the slope limit and the Gaussian.
 
     Returns:
       (X, Y) m, at the centres of squares of 2 x 2 cells.
     """
+    cell_m, half_m = config.surface_cell_m, config.surface_half_m
     num_cells = int(2 * half_m / cell_m)
-    deviation = xyz[:, 2] - plane_elevation(xyz, coefficients, min_height_m=min_height_m)
+    deviation = height_above_planes(xyz, planes, tolerance_m=float(config.min_height_m))
     rho = np.hypot(xyz[:, 0], xyz[:, 1])
     index = np.floor((xyz[:, :2] + half_m) / cell_m).astype(int)
-    ground = ((index >= 0) & (index < num_cells)).all(axis=1) & (rho > blind_radius_m)
-    ground &= deviation > -(band_below_m + band_below_grade * rho)
-    ground &= deviation < band_above_m + band_above_grade * rho
+    ground = ((index >= 0) & (index < num_cells)).all(axis=1) & (rho > config.blind_radius_m)
+    ground &= deviation > -(config.band_below_m + config.band_below_grade * rho)
+    ground &= deviation < config.band_above_m + config.band_above_grade * rho
     lowest = np.full((num_cells, num_cells), np.inf)
     np.minimum.at(lowest, tuple(index[ground].T), deviation[ground])
-    envelope = _lower_envelope(lowest, step=max_grade * cell_m, num_rounds=num_envelope_rounds)
+    step = float(config.max_grade * cell_m)
+    envelope = _lower_envelope(lowest, step=step, num_rounds=config.num_envelope_rounds)
     # Empty cells are inf on both sides, which is not below.
-    return _fill_and_smooth(lowest, lowest < envelope + envelope_margin_m, sigma=smoothing_m / cell_m)
+    valid = lowest < envelope + config.envelope_margin_m
+    return _fill_and_smooth(lowest, valid, sigma=float(config.smoothing_m / cell_m))
 
 
 def _lower_envelope(lowest: np.ndarray, *, step: float, num_rounds: int) -> np.ndarray:
@@ -265,65 +303,46 @@ def _pool(grid: np.ndarray, size: int) -> np.ndarray:
     return grid.reshape(len(grid) // size, size, -1, size).mean(axis=(1, 3))
 
 
-def surface_deviation(xy: np.ndarray, grid: np.ndarray, *, cell_m: float, half_m: float) -> np.ndarray:
-    """Bilinear interpolation of the grid; its border value holds beyond it.
+def surface_height(surface: np.ndarray, xy: np.ndarray, config: GroundConfig) -> np.ndarray:
+    """Height of the ground grid over the planes, bilinear between the centres of its squares.
 
     Args:
-      xy: (n, 2) m.
-      grid: (X, Y) m, at the centres of the cells.
-      cell_m: edge of the cells.
-      half_m: the grid covers |x|, |y| below this.
+      surface: (X, Y) m.
+      xy: (n, 2) m; beyond the grid its border holds.
+      config: as `fit_ground_surface` had it.
 
     Returns:
       (n,) m.
     """
-    position = ((xy + half_m) / cell_m - 0.5).T
-    return ndimage.map_coordinates(grid, position, order=1, mode="nearest")
+    square_m = POOL_CELLS * config.surface_cell_m
+    position = ((xy + config.surface_half_m) / square_m - 0.5).T
+    return ndimage.map_coordinates(surface, position, order=1, mode="nearest")
 
 
 def ground_elevation(
-    xyz: np.ndarray,
-    coefficients: np.ndarray,
-    grid: np.ndarray | None,
-    *,
-    cell_m: float,
-    half_m: float,
-    min_height_m: float = 0.0,
+    xyz: np.ndarray, planes: np.ndarray, surface: np.ndarray | None, config: GroundConfig
 ) -> np.ndarray:
-    """z of the ground under points: the plane and the surface's deviation from it.
+    """z of the ground under points: the plane and the grid's height over it.
 
     Args:
       xyz: (n, 3) m; z only matters with several planes.
-      coefficients: (3,) or (planes, 3).
-      grid: (X, Y) m, or None for the plane alone.
-      cell_m: edge of the cells of `fit_ground_surface`.
-      half_m: the grid covers |x|, |y| below this.
-      min_height_m: as in `plane_elevation`.
+      planes: (3,) or (planes, 3).
+      surface: (X, Y) m, or None for the planes alone.
+      config: of the ground.
 
     Returns:
       (n,) m.
     """
-    elevation = plane_elevation(xyz, coefficients, min_height_m=min_height_m)
-    if grid is None:
-        return elevation
-    return elevation + surface_deviation(xyz[:, :2], grid, cell_m=POOL_CELLS * cell_m, half_m=half_m)
+    elevation = plane_elevation(xyz, planes, tolerance_m=float(config.min_height_m))
+    return elevation if surface is None else elevation + surface_height(surface, xyz[:, :2], config)
 
 
 def height_above_ground(
-    xyz: np.ndarray,
-    coefficients: np.ndarray,
-    grid: np.ndarray | None,
-    *,
-    cell_m: float,
-    half_m: float,
-    min_height_m: float = 0.0,
+    xyz: np.ndarray, planes: np.ndarray, surface: np.ndarray | None, config: GroundConfig
 ) -> np.ndarray:
     """Height of points above the ground; the arguments are those of `ground_elevation`.
 
     Returns:
       (n,) m.
     """
-    elevation = ground_elevation(
-        xyz, coefficients, grid, cell_m=cell_m, half_m=half_m, min_height_m=min_height_m
-    )
-    return xyz[:, 2] - elevation
+    return xyz[:, 2] - ground_elevation(xyz, planes, surface, config)

@@ -86,7 +86,7 @@ def likely_sizes(
     Returns:
       Length and width (...) float32, m, at least as measured.
 
-    Reference: oracle `jaxbox.reference.likely_size`.
+    Reference: oracle `jaxbox.reference.likely_sizes`.
     """
 
     def likely(

@@ -291,7 +291,7 @@ def place_widths(sides: Assignments, prior: ClassPrior) -> Placements:
     Returns:
       The placements: the length is completed away from the sensor.
 
-    Reference: oracle `jaxbox.reference.complete_box`.
+    Reference: oracle `jaxbox.reference.place_widths`.
     """
     length, width = (
         jnp.maximum(a, b) for a, b in zip((prior.length_m, prior.width_m), sides.measured, strict=True)

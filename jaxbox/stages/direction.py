@@ -74,7 +74,7 @@ def count_votes(
     Returns:
       (A,) float32, to be added to the curves; zero where no box votes.
 
-    Reference: oracle `jaxbox.reference.scene_direction`.
+    Reference: oracle `jaxbox.reference.count_votes`.
     """
     num_angles, sigma_deg = config.num_angles, config.direction_sigma_deg
     bins = jnp.arange(num_angles, dtype=jnp.float32) * (90.0 / num_angles)

@@ -188,7 +188,7 @@ def cast_rays(evidence: Evidence, boxes: FlatBoxes, config: EvidenceConfig, *, n
     Returns:
       The fractions.
 
-    Reference: oracle `jaxbox.reference.box_evidence`.
+    Reference: oracle `jaxbox.reference.cast_rays`.
     """
     center, shape = boxes.center.reshape(-1, 2), boxes.center.shape[:-1]
     sides = (jnp.broadcast_to(a, shape).reshape(-1) for a in (boxes.length, boxes.width, boxes.yaw))

@@ -103,7 +103,7 @@ def try_rotations(
       curve: (A, P) float32.
       extents: (4, A, P) float32, m: lower and upper bounds of u, then of v; 0 without points.
 
-    Reference: paper, Algorithm III; oracles `jaxbox.reference.criterion_curve`, cv2.minAreaRect.
+    Reference: paper, Algorithm III; oracles `jaxbox.reference.try_rotations`, cv2.minAreaRect.
     """
     num_angles = config.num_angles
     angle = (np.arange(num_angles) * (math.pi / 2 / num_angles))[:, None]

@@ -6,11 +6,61 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import KDTree
 
-NO_CLUSTER = -1
-"""Component or slot of a point that has none."""
+from jaxbox.config import ClusteringConfig, ComponentMap, DetectorConfig, RegionConfig
+from jaxbox.reference.state import NO_CLUSTER, Cluster, Clusters, Obstacles
 
 
-def warp_range(xy: np.ndarray, *, start_m: float, growth: float) -> np.ndarray:
+def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> list[Clusters]:
+    """Labels the components of every map, and lists the clusters that pass the size gates.
+
+    Args:
+      obstacles: m points.
+      config: of the detector.
+
+    Returns:
+      The clusters of each map.
+    """
+    return [find_clusters(obstacles, component_map, config) for component_map in config.clustering.maps]
+
+
+def find_clusters(obstacles: Obstacles, component_map: ComponentMap, config: DetectorConfig) -> Clusters:
+    """Finds the clusters of one component map.
+
+    Args:
+      obstacles: m points.
+      component_map: the map.
+      config: of the detector.
+
+    Returns:
+      The clusters; those that the map has no room for are left out, and counted.
+    """
+    height, clustering = obstacles.height, config.clustering
+    member = (height > component_map.min_height_m) & (height < component_map.max_height_m)
+    xy = obstacles.xyz[member, :2]
+    near = compress_range(
+        xy, start_m=float(clustering.adaptive_start_m), growth=float(clustering.adaptive_growth)
+    )
+    cells, shape = find_cells(near, height[member], component_map, config.region)
+    component, of_point = np.full(len(member), NO_CLUSTER), np.full(len(member), NO_CLUSTER)
+    component[member] = label_components(cells, shape)
+    of_point[member], num_found = select_clusters(
+        xy, component[member], clustering, min_extent_m=float(config.vehicles.min_extent_m)
+    )
+    of_point[of_point >= component_map.max_clusters] = NO_CLUSTER
+    return Clusters(
+        component, of_point, _list_clusters(of_point, height), count_runs(cells, shape), num_found
+    )
+
+
+def _list_clusters(of_point: np.ndarray, height: np.ndarray) -> list[Cluster]:
+    order = np.argsort(of_point, kind="stable")
+    order = order[of_point[order] != NO_CLUSTER]
+    starts = np.flatnonzero(np.diff(of_point[order])) + 1
+    groups = np.split(order, starts) if len(order) else []
+    return [Cluster(rows, float(height[rows].min()), float(height[rows].max())) for rows in groups]
+
+
+def compress_range(xy: np.ndarray, *, start_m: float, growth: float) -> np.ndarray:
     """Draws far points together, so that a fixed cell links over a distance that grows with range.
 
     rho' = rho up to the start, start + log(1 + growth (rho - start)) / growth beyond.
@@ -31,33 +81,24 @@ def warp_range(xy: np.ndarray, *, start_m: float, growth: float) -> np.ndarray:
     return xy * (warped / np.where(rho > 0, rho, 1.0))[:, None]
 
 
-def grid_cells(
-    xy: np.ndarray,
-    height: np.ndarray,
-    *,
-    cell_m: float,
-    num_levels: int,
-    half_x_m: float,
-    half_y_m: float,
-    min_height_m: float,
+def find_cells(
+    xy: np.ndarray, height: np.ndarray, component_map: ComponentMap, region: RegionConfig
 ) -> tuple[np.ndarray, tuple[int, int, int]]:
     """Cell of each point on the grid of a component map.
 
     Args:
-      xy: (n, 2) m, within the region, warped or not.
+      xy: (n, 2) m, within the region, compressed or not.
       height: (n,) m above the ground.
-      cell_m: edge of the cells.
-      num_levels: cells in height; points beyond join the end levels.
-      half_x_m: the grid covers |x| below this.
-      half_y_m: the grid covers |y| below this.
-      min_height_m: height at which the lowest level starts.
+      component_map: its lowest level starts at its least height; points beyond join the end levels.
+      region: that the grid covers.
 
     Returns:
       (n, 3) int and the grid's shape.
     """
-    half = np.array([half_x_m, half_y_m])
+    cell_m, num_levels = component_map.cell_m, component_map.num_levels
+    half = np.array([region.half_x_m, region.half_y_m])
     planar = np.floor((xy + half) / cell_m)
-    level = np.floor((height - min_height_m) / cell_m)
+    level = np.floor((height - component_map.min_height_m) / cell_m)
     num_x, num_y = np.ceil(2 * half / cell_m).astype(int)
     shape = (int(num_x), int(num_y), num_levels)
     cells = np.column_stack([planar, level])
@@ -106,17 +147,16 @@ def count_runs(cells: np.ndarray, shape: tuple[int, int, int]) -> int:
     return int(line[0].sum() + (line[1:] & ~line[:-1]).sum())
 
 
-def keep_clusters(
-    xy: np.ndarray, component: np.ndarray, *, min_points: float, min_extent_m: float, max_extent_m: float
+def select_clusters(
+    xy: np.ndarray, component: np.ndarray, config: ClusteringConfig, *, min_extent_m: float
 ) -> tuple[np.ndarray, int]:
     """Numbers the components that pass the size gates.
 
     Args:
-      xy: (n, 2) m, true, not warped.
+      xy: (n, 2) m, true, not compressed.
       component: (n,) int, from 0.
-      min_points: components with fewer points are left out.
+      config: components with fewer points, or longer along x or y, are left out.
       min_extent_m: components whose extents along x and y have a shorter diagonal are left out.
-      max_extent_m: components longer along x or y are left out.
 
     Returns:
       (n,) int: cluster of each point in the order of the components, `NO_CLUSTER` where it has none;
@@ -129,7 +169,7 @@ def keep_clusters(
         ndimage.maximum(xy[:, axis], component, ids) - ndimage.minimum(xy[:, axis], component, ids)
         for axis in range(2)
     ]
-    kept = (np.bincount(component) >= min_points) & (np.max(extents, axis=0) <= max_extent_m)
+    kept = (np.bincount(component) >= config.min_points) & (np.max(extents, axis=0) <= config.max_extent_m)
     kept &= np.hypot(*extents) >= min_extent_m
     slot = np.where(kept, np.cumsum(kept) - 1, NO_CLUSTER)
     return slot[component], int(kept.sum())

@@ -1,0 +1,92 @@
+"""Convex hull (paper, 3.3), and the points that rectangles are fitted to."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from jaxbox.config import BoxConfig, DetectorConfig
+from jaxbox.reference.state import Cluster, Obstacles
+
+
+def outline_clusters(
+    obstacles: Obstacles, clusters: Sequence[Cluster], config: DetectorConfig
+) -> list[np.ndarray]:
+    """The points of each cluster that its rectangle is fitted to: its hull (the paper), or those of the slab.
+
+    Args:
+      obstacles: m points.
+      clusters: of the points.
+      config: of the detector.
+
+    Returns:
+      (j, 2) m of each cluster.
+    """
+    if config.box.fit_to == "hull":
+        return convex_hulls([obstacles.xyz[cluster.members, :2] for cluster in clusters])
+    chosen = (fit_points(cluster.members, obstacles.height, config.box) for cluster in clusters)
+    return [obstacles.xyz[rows, :2] for rows in chosen]
+
+
+def fit_points(members: np.ndarray, height: np.ndarray, config: BoxConfig) -> np.ndarray:
+    """The members of a cluster that its rectangle is fitted to.
+
+    Args:
+      members: (m,) int, rows of the cluster's points in sweep order.
+      height: (n,) m above the ground, of all points.
+      config: members between the slab's heights, both exclusive, are taken, unless they are too few: then
+        all are. At most `max_points`, spread evenly: the floor(j count / max_points)-th.
+
+    Returns:
+      (k,) int, k <= max_points.
+    """
+    slab = members[
+        (height[members] > config.slab_min_height_m) & (height[members] < config.slab_max_height_m)
+    ]
+    chosen = slab if len(slab) >= config.min_slab_points else members
+    if len(chosen) <= config.max_points:
+        return chosen
+    return chosen[np.arange(config.max_points) * len(chosen) // config.max_points]
+
+
+def convex_hulls(clusters: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Vertices of the convex hulls of clusters, see `convex_hull`.
+
+    Args:
+      clusters: (n, 2) m each.
+
+    Returns:
+      (h, 2) m each.
+    """
+    return [convex_hull(xy) for xy in clusters]
+
+
+def convex_hull(xy: np.ndarray) -> np.ndarray:
+    """Vertices of the convex hull.
+
+    Args:
+      xy: (n, 2) m; rounded to float32.
+
+    Returns:
+      (h, 2) m, counter-clockwise; (0, 2) without points, one or two points where all are in line.
+    """
+    if len(xy) == 0:
+        return np.zeros((0, 2))
+    index = cv2.convexHull(np.ascontiguousarray(xy, np.float32), returnPoints=False).reshape(-1).astype(int)
+    hull = np.asarray(xy, np.float64)[index]
+    return hull if polygon_area(hull) >= 0 else hull[::-1]
+
+
+def polygon_area(polygon: np.ndarray) -> float:
+    """Area of a polygon, positive where it turns counter-clockwise.
+
+    Args:
+      polygon: (h, 2) m.
+
+    Returns:
+      m^2.
+    """
+    if len(polygon) == 0:
+        return 0.0
+    x, y = (polygon - polygon[0]).T
+    return float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y) / 2)

@@ -1,0 +1,144 @@
+"""Rectangles by trying all rotations (paper, section 3.4, Algorithm III)."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from jaxbox.config import BoxConfig, DetectorConfig
+from jaxbox.reference.state import Rectangle, Rotations
+
+PREFERENCE_GAIN = 5.0
+"""How often the scene's direction counts for the second candidate of a cluster."""
+
+
+def fit_rectangles(outlines: Sequence[np.ndarray], config: BoxConfig) -> list[Rotations]:
+    """Rectangles of all clusters at all rotations.
+
+    Args:
+      outlines: (n, 2) m, the points of each cluster.
+      config: criterion and rotations.
+
+    Returns:
+      The rectangles of each cluster.
+    """
+    return [Rotations(*try_rotations(xy, config)) for xy in outlines]
+
+
+def best_rectangles(
+    rotations: Sequence[Rotations], preference: np.ndarray, *, gain: float = 1.0
+) -> list[Rectangle]:
+    """The rectangle of each cluster at its best rotation.
+
+    Args:
+      rotations: of the clusters.
+      preference: (A,), added to every curve.
+      gain: how often the preference counts when the rotation is chosen; the score counts it once.
+
+    Returns:
+      The rectangles; of equally good rotations the first.
+    """
+
+    def best_of(rotations: Rotations) -> Rectangle:
+        best = int(np.argmax(rotations.curve + gain * preference))
+        score = float(rotations.curve[best] + preference[best])
+        return Rectangle(rotations.extents[best], best * np.pi / 2 / len(preference), score)
+
+    return [best_of(each) for each in rotations]
+
+
+def rectangle_candidates(
+    rotations: Sequence[Rotations], preference: np.ndarray, config: DetectorConfig
+) -> list[list[Rectangle]]:
+    """The rectangles of each cluster that the evidence is to choose from.
+
+    Args:
+      rotations: of the clusters.
+      preference: (A,), for the scene's direction.
+      config: of the detector.
+
+    Returns:
+      Those at the best rotation, and, where the preset asks, those along the scene's direction: a list each.
+    """
+    gains = [1.0]
+    if config.box.scene_direction and config.completion.along_scene:
+        gains.append(PREFERENCE_GAIN)
+    return [best_rectangles(rotations, preference, gain=gain) for gain in gains]
+
+
+def try_rotations(xy: np.ndarray, config: BoxConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds a cluster by a rectangle at every rotation over 90 degrees, and rates them (larger is better).
+
+    At angle t the coordinates are u = x cos t + y sin t and v = -x sin t + y cos t.
+
+    - "area": minus the rectangle's area.
+    - "variance": minus the variances of the distances to the nearer edge of each pair of edges,
+      over the points nearer to that pair.
+    - "closeness": mean of min_distance / max(distance to the nearest edge, min_distance).
+    - "visible_closeness": the same with the two edges nearer to the sensor only.
+
+    Args:
+      xy: (n, 2) m, sensor frame, n >= 1.
+      config: one of those criteria, the number of rotations A, and the distance below which points count as
+        on the edge.
+
+    Returns:
+      (A,) values, and (A, 4) m: smallest and largest u, smallest and largest v.
+
+    Raises:
+      ValueError: for another criterion.
+
+    Reference:
+      Zhang et al. 2017, "Efficient L-Shape Fitting for Vehicle Detection Using Laser Scanners".
+    """
+    criterion = config.criterion
+    angle = (np.arange(config.num_angles) * np.pi / 2 / config.num_angles)[:, None]
+    cos, sin = np.cos(angle), np.sin(angle)
+    x, y = xy.astype(np.float64).T
+    u, v = x * cos + y * sin, -x * sin + y * cos
+    extents = np.column_stack([u.min(axis=1), u.max(axis=1), v.min(axis=1), v.max(axis=1)])
+    u0, u1, v0, v1 = extents.T[..., None]
+    if criterion == "area":
+        return -((u1 - u0) * (v1 - v0))[:, 0], extents
+    if criterion == "visible_closeness":
+        to_u = np.abs(u - np.where(np.abs(u0) < np.abs(u1), u0, u1))
+        to_v = np.abs(v - np.where(np.abs(v0) < np.abs(v1), v0, v1))
+    else:
+        to_u, to_v = np.minimum(u - u0, u1 - u), np.minimum(v - v0, v1 - v)
+    if criterion == "variance":
+        return -_variance(to_u, to_u < to_v) - _variance(to_v, to_v <= to_u), extents
+    if criterion not in ("closeness", "visible_closeness"):
+        raise ValueError(
+            f"criterion is {criterion!r}; it must be area, variance, closeness or visible_closeness."
+        )
+    min_distance_m = float(config.min_distance_m)
+    distance = np.maximum(np.minimum(to_u, to_v), min_distance_m)
+    return (min_distance_m / distance).mean(axis=1), extents
+
+
+def _variance(values: np.ndarray, where: np.ndarray) -> np.ndarray:
+    """Population variance along rows over the chosen values; 0 where there are none."""
+    count = np.maximum(where.sum(axis=1), 1)
+    mean = np.sum(values, axis=1, where=where) / count
+    return np.sum((values - mean[:, None]) ** 2, axis=1, where=where) / count
+
+
+def min_area_rectangle(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+    """The rectangle of smallest area round points, by rotating calipers.
+
+    Args:
+      xy: (n, 2) m, n >= 1.
+
+    Returns:
+      Centre (2,) m, length and width (2,) m with length >= width, and yaw in [-pi/2, pi/2).
+    """
+    # Near the origin float32 costs nothing.
+    origin = np.mean(xy, axis=0)
+    center, (along, across), angle_deg = cv2.minAreaRect(np.ascontiguousarray(xy - origin, np.float32))
+    yaw = np.radians(angle_deg) + (0.0 if along >= across else np.pi / 2)
+    return origin + center, np.array([max(along, across), min(along, across)]), wrap_yaw(yaw)
+
+
+def wrap_yaw(yaw: float) -> float:
+    """Wraps the angle of an axis, which has no front, to [-pi/2, pi/2)."""
+    return float((yaw + np.pi / 2) % np.pi - np.pi / 2)

@@ -1,0 +1,362 @@
+"""Vehicle decision: the score of a box, what surrounds it, and non-maximum suppression."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from scipy.special import expit
+
+from jaxbox.config import ClassPrior, DetectorConfig, Scalar, VehicleConfig
+from jaxbox.reference.state import (
+    Candidate,
+    ClassHypothesis,
+    Cluster,
+    Completed,
+    CompletedBox,
+    Kept,
+    NeighbourhoodCounts,
+    Obstacles,
+    RayFractions,
+)
+
+PSEUDO_COUNT = 5
+"""So many upper points, with the share of the full score behind the faces, are added."""
+NUM_LEVELS = 20
+"""Levels of height by which the top is found,"""
+LOWEST_LEVEL = 0.4
+"""from this share of the highest that points of the vehicle may have."""
+
+
+def score_boxes(
+    completed: Completed,
+    rays: tuple[RayFractions, np.ndarray] | None,
+    clusters: Sequence[Cluster],
+    obstacles: Obstacles,
+    config: DetectorConfig,
+) -> list[Candidate]:
+    """Scores the boxes by rays, size, and what surrounds them.
+
+    Args:
+      completed: q boxes.
+      rays: what the rays over each box met, and the ground support round it; None without evidence.
+      clusters: of all maps.
+      obstacles: all points above the ground.
+      config: of the detector.
+
+    Returns:
+      What scores more than the least score, best first.
+    """
+
+    def judge(row: int, hypothesis: ClassHypothesis, box: CompletedBox) -> Candidate:
+        cluster, prior = clusters[hypothesis.cluster], config.vehicles.classes[hypothesis.label]
+        around = _look_around(box.box, prior, cluster, obstacles, config.vehicles)
+        hit, free_length, support = 1.0, 0.0, None
+        if rays is not None:
+            hit, free_length, support = (float(a[row]) for a in (rays[0].hit, rays[0].free_length, rays[1]))
+        score = score_box(
+            box,
+            prior,
+            around=around,
+            num_points=len(cluster.members),
+            hit=hit,
+            free_length=free_length,
+            support=support,
+            config=config.vehicles,
+        )
+        return Candidate(hypothesis, box, around, score)
+
+    pairs = zip(completed.hypotheses, completed.boxes, strict=True)
+    candidates = [judge(row, *pair) for row, pair in enumerate(pairs)]
+    candidates = [candidate for candidate in candidates if candidate.score > config.vehicles.min_score]
+    return sorted(candidates, key=lambda candidate: -candidate.score)
+
+
+def _look_around(
+    box: np.ndarray, prior: ClassPrior, cluster: Cluster, obstacles: Obstacles, config: VehicleConfig
+) -> NeighbourhoodCounts:
+    if not config.neighbourhood:
+        return cluster_alone(len(cluster.members), cluster.top_m)
+    return count_points_around(box, prior, obstacles, config)
+
+
+def keep_best(candidates: Sequence[Candidate], config: VehicleConfig) -> Kept:
+    """The candidates that overlap no better one.
+
+    Args:
+      candidates: best score first.
+      config: the overlap, and how many are looked at and kept at most.
+
+    Returns:
+      Those that stay.
+    """
+    best = candidates[: config.max_candidates]
+    boxes = np.array([candidate.completed.box for candidate in best]).reshape(-1, 5)
+    scores = np.array([candidate.score for candidate in best])
+    rows = non_max_suppression(boxes, scores, max_overlap=float(config.max_overlap))
+    return Kept([best[row] for row in rows[: config.max_detections]], len(rows))
+
+
+def distance_outside(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """How far points lie outside a box, along its worse axis; negative inside.
+
+    Args:
+      xy: (n, 2) m.
+      box: (5,): x, y, length, width in m and yaw in rad.
+
+    Returns:
+      (n,) m.
+    """
+    x, y, length, width, yaw = box
+    dx, dy = xy[:, 0] - x, xy[:, 1] - y
+    along = np.abs(dx * np.cos(yaw) + dy * np.sin(yaw)) - length / 2
+    across = np.abs(-dx * np.sin(yaw) + dy * np.cos(yaw)) - width / 2
+    return np.maximum(along, across)
+
+
+def count_points_around(
+    box: np.ndarray, prior: ClassPrior, obstacles: Obstacles, config: VehicleConfig
+) -> NeighbourhoodCounts:
+    """Counts the points of the whole sweep in and round a box.
+
+    Args:
+      box: (5,): x, y, length, width in m and yaw in rad.
+      prior: points lower than `count_max_height_m` belong to the vehicle, and those farther than `recess_m`
+        behind each face that the sensor sees are recessed.
+      obstacles: all points above the ground.
+      config: a point less than the margin outside counts as inside, one farther but less than the ring is in
+        the ring; which points are upper ones, and which share of those inside may lie above the top.
+
+    Returns:
+      The counts.
+    """
+    if obstacles.tree is None:
+        return cluster_alone(0, 0.0)
+    reach_m = np.hypot(box[2], box[3]) / 2 + 2 * config.ring_m
+    near = obstacles.tree.query_ball_point(box[:2], reach_m)
+    xy, height = obstacles.xyz[near, :2], obstacles.height[near]
+    outside = distance_outside(xy, box)
+    within = outside < config.margin_m
+    counted = height < prior.count_max_height_m
+    upper = within & counted & (height > config.upper_height_m)
+    top = top_of(height[within & counted], float(prior.count_max_height_m), float(config.top_quantile))
+    return NeighbourhoodCounts(
+        num_inside=int((within & counted).sum()),
+        top=top,
+        num_above=int((within & ~counted).sum()),
+        num_ring=int((~within & (outside < config.ring_m) & counted).sum()),
+        num_upper=int(upper.sum()),
+        num_recessed=int((upper & (depth_behind_faces(xy, box) > prior.recess_m)).sum()),
+    )
+
+
+def cluster_alone(num_points: int, top: float) -> NeighbourhoodCounts:
+    """What surrounds a box of which only the cluster is looked at: nothing.
+
+    Args:
+      num_points: of the cluster.
+      top: m above the ground, of the cluster.
+
+    Returns:
+      The counts.
+    """
+    return NeighbourhoodCounts(num_inside=num_points, top=top, num_above=0, num_ring=0)
+
+
+def top_of(height: np.ndarray, max_height_m: float, top_quantile: float) -> float:
+    """The height that a share of the points of a vehicle exceed, so that a stray return is no roof.
+
+    Args:
+      height: (n,) m above the ground, below the next.
+      max_height_m: highest that they may have; points above 0.4 of it are counted in 20 levels.
+      top_quantile: of the points; those of a level count as spread evenly over it.
+
+    Returns:
+      m; at most the highest, and that where no point is in a level.
+    """
+    if len(height) == 0:
+        return 0.0
+    edges = np.linspace(LOWEST_LEVEL * max_height_m, max_height_m, NUM_LEVELS + 1)
+    left = top_quantile * len(height)
+    counts, _ = np.histogram(height, edges)
+    for count, low, high in zip(counts[::-1], edges[-2::-1], edges[:0:-1], strict=True):
+        if count > left:
+            return float(min(high - (high - low) * left / count, height.max()))
+        left -= count
+    return float(height.max())
+
+
+def depth_behind_faces(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """How far points lie behind the nearest face that a sensor at the origin sees; negative in front.
+
+    Args:
+      xy: (n, 2) m.
+      box: (5,): x, y, length, width in m and yaw in rad.
+
+    Returns:
+      (n,) m; infinite where the sensor is inside the box.
+    """
+    x, y, length, width, yaw = box
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    local, sensor = (xy - [x, y]) @ turn, np.array([-x, -y]) @ turn
+    depth = np.full(len(xy), np.inf)
+    for axis, half in enumerate((length / 2, width / 2)):
+        if abs(sensor[axis]) > half:
+            depth = np.minimum(depth, half - np.sign(sensor[axis]) * local[:, axis])
+    return depth
+
+
+def score_box(
+    box: CompletedBox,
+    prior: ClassPrior,
+    *,
+    around: NeighbourhoodCounts,
+    num_points: int,
+    hit: float,
+    free_length: float,
+    support: float | None,
+    config: VehicleConfig,
+) -> float:
+    """How much a box looks like a vehicle of a class: a product of factors in [0, 1].
+
+    Args:
+      box: completed.
+      prior: the class.
+      around: points in and round the box.
+      num_points: points of the cluster.
+      hit: share of the rays that end at the box.
+      free_length: share of the box seen to be free.
+      support: ground points round the box, or None where they were not counted.
+      config: of the score.
+
+    Returns:
+      The score; 0 where a gate of the class closes.
+    """
+    if max(box.measured_length_m, box.measured_width_m) < config.min_extent_m:
+        return 0.0
+    rho = float(np.hypot(box.box[0], box.box[1]))
+    score = evidence_score(num_points, hit, free_length, support, box.objective, config)
+    score *= size_score(box.box[2:4], prior) * neighbourhood_score(around, rho, prior, config)
+    return float(score * prior.prior_weight)
+
+
+def asymmetric_gaussian(value: Scalar, peak: Scalar, below: Scalar, above: Scalar) -> float:
+    """exp(-((value - peak) / width)^2), with its own width on either side."""
+    return float(np.exp(-(((value - peak) / (below if value < peak else above)) ** 2)))
+
+
+def evidence_score(
+    num_points: int,
+    hit: float,
+    free_length: float,
+    support: float | None,
+    objective: float,
+    config: VehicleConfig,
+) -> float:
+    """The part of the score that the rays and the cluster decide.
+
+    Args:
+      num_points: points of the cluster.
+      hit: share of the rays that end at the box.
+      free_length: share of the box seen to be free.
+      support: ground points round the box, or None where they were not counted.
+      objective: J of the completion.
+      config: (points / saturation)^power, exp(-(free_length / scale)^2), full score from a number of ground
+        points, and 1 / (1 + exp(-(J - gate) / softness)).
+
+    Returns:
+      In [0, 1].
+    """
+    score = hit * min(1.0, num_points / config.saturation_points) ** config.sparseness_power
+    score *= np.exp(-((free_length / config.free_scale) ** 2))
+    if support is not None:
+        score *= min(1.0, (support + 0.5) / config.support_points)
+    return float(score * expit((objective - config.objective_gate) / config.objective_softness))
+
+
+def size_score(size: np.ndarray, prior: ClassPrior) -> float:
+    """How well the box's length and width match the class.
+
+    Args:
+      size: (2,) m: length, width.
+      prior: of the class.
+
+    Returns:
+      In [0, 1].
+    """
+    length, width = size
+    score = asymmetric_gaussian(length, prior.length_m, prior.length_below_m, prior.length_above_m)
+    tolerance_m = prior.width_tolerance_m
+    return score * asymmetric_gaussian(width, prior.width_m, tolerance_m, tolerance_m)
+
+
+def neighbourhood_score(
+    around: NeighbourhoodCounts, rho: float, prior: ClassPrior, config: VehicleConfig
+) -> float:
+    """The part of the score that the points in and round the box decide.
+
+    Args:
+      around: see `count_points_around`.
+      rho: m, range of the box: it may be higher than its top by `top_grade` times this.
+      prior: of the class.
+      config: exp(-(ring weight x ring + overhead weight x above) / inside), and a factor from
+        `upright_score`, where no upper point is recessed, to 1 from the share `recess_share` on.
+
+    Returns:
+      In [0, 1]; 0 where a gate of the class closes.
+    """
+    highest = around.top + config.top_grade * rho
+    if not (prior.min_height_m < highest and around.top < prior.max_height_m):
+        return 0.0
+    height = min(max(prior.height_m, around.top), highest)
+    score = asymmetric_gaussian(height, prior.height_m, prior.height_below_m, prior.height_above_m)
+    clutter = config.ring_weight * around.num_ring + config.overhead_weight * around.num_above
+    score *= np.exp(-clutter / max(around.num_inside, 1))
+    share = around.num_recessed + PSEUDO_COUNT * config.recess_share
+    share = share / (around.num_upper + PSEUDO_COUNT)
+    upright = config.upright_score + (1 - config.upright_score) * min(1.0, share / config.recess_share)
+    return float(score * upright)
+
+
+def bev_iou(first: np.ndarray, second: np.ndarray) -> float:
+    """Overlap of two rectangles in the bird's-eye view: intersection over union.
+
+    Args:
+      first: (5,): x, y, length, width in m and yaw in rad.
+      second: (5,).
+
+    Returns:
+      In [0, 1]; 0 for two boxes without area.
+    """
+    # OpenCV works in float32: keep the numbers small.
+    offset = second[:2] - first[:2]
+    rectangles = [
+        ((0.0, 0.0), (first[2], first[3]), np.degrees(first[4])),
+        ((offset[0], offset[1]), (second[2], second[3]), np.degrees(second[4])),
+    ]
+    kind, corners = cv2.rotatedRectangleIntersection(*rectangles)
+    if kind == cv2.INTERSECT_NONE or corners is None:
+        return 0.0
+    shared = cv2.contourArea(cv2.convexHull(corners))
+    union = first[2] * first[3] + second[2] * second[3] - shared
+    return float(np.clip(shared / union, 0.0, 1.0)) if union > 0 else 0.0
+
+
+def non_max_suppression(boxes: np.ndarray, scores: np.ndarray, *, max_overlap: float) -> np.ndarray:
+    """Greedy suppression: of two overlapping boxes the one with the higher score stays.
+
+    Args:
+      boxes: (k, 5): x, y, length, width in m and yaw in rad.
+      scores: (k,); of equal ones the first goes first.
+      max_overlap: a larger IoU with a better box that stays suppresses.
+
+    Returns:
+      (d,) int, rows of the boxes that stay, best score first.
+    """
+    kept: list[int] = []
+    reach = np.hypot(boxes[:, 2], boxes[:, 3]) / 2
+    for row in np.argsort(-scores, kind="stable"):
+        gap = np.hypot(*(boxes[kept, :2] - boxes[row, :2]).T)
+        rivals = np.array(kept, int)[gap <= reach[kept] + reach[row]]
+        if all(bev_iou(boxes[row], boxes[rival]) <= max_overlap for rival in rivals):
+            kept.append(int(row))
+    return np.array(kept, int)
