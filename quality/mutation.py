@@ -36,7 +36,18 @@ TESTS: Mapping[str, str] = {
     "jaxbox/stages/rectangles.py": (
         "tests/test_parity_boxes.py -k '(synthetic or direction) and not hull and not extreme'"
     ),
-    "jaxbox/xla/masked.py": "tests/test_masked.py",
+    "jaxbox/xla/arithmetic.py": "tests/test_xla_numbers.py",
+    "jaxbox/xla/bits.py": "tests/test_xla_numbers.py -k bit",
+    "jaxbox/xla/components.py": "tests/test_xla_structures.py -k component",
+    "jaxbox/xla/hulls.py": "tests/test_xla_structures.py -k hull",
+    "jaxbox/xla/loops.py": "tests/test_xla_loops.py",
+    "jaxbox/xla/ragged.py": "tests/test_xla_structures.py -k point",
+    "jaxbox/xla/range_bits.py": "tests/test_xla_structures.py -k 'covered or next_set or words_at'",
+    "jaxbox/xla/rows.py": "tests/test_xla_rows.py",
+    "jaxbox/xla/runs.py": "tests/test_xla_structures.py -k 'runs or kinds or maximum'",
+    "jaxbox/xla/segments.py": "tests/test_xla_structures.py -k 'segment or keys'",
+    "jaxbox/xla/sorting.py": "tests/test_xla_sorting.py",
+    "jaxbox/xla/suppression.py": "tests/test_xla_structures.py -k conflicts",
 }
 """The fast tests of each module, as arguments of pytest."""
 

@@ -23,7 +23,8 @@ FAST = {
     "test_io_files.py", "test_io_formats.py", "test_io_kitti.py", "test_io_other_sensors.py",
     "test_packaging.py", "test_paper_table.py", "test_reference.py", "test_reliability_benchmarks.py",
     "test_sensors_benchmark.py", "test_speed_benchmarks.py", "test_synthetic.py", "test_tuning.py",
-    "test_types.py", "test_viz.py", "test_viz_judged.py",
+    "test_types.py", "test_viz.py", "test_viz_judged.py", "test_xla_laws.py", "test_xla_loops.py",
+    "test_xla_numbers.py", "test_xla_rows.py", "test_xla_sorting.py", "test_xla_structures.py",
 }  # fmt: skip
 """Files whose tests make up ``pytest -m fast``, but for the tests in `SLOW`."""
 SLOW = {

@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import parity
@@ -13,7 +12,7 @@ from jaxbox import DetectorConfig
 from jaxbox.config import ComponentMap
 from jaxbox.stages.clustering import propose_clusters
 from jaxbox.stages.state import Obstacles
-from jaxbox.xla import backend, rows, sorting
+from jaxbox.xla import backend, rows
 from jaxbox.xla.chunks import MAP_POINTS as CHUNK
 
 ROOM = CHUNK + 900
@@ -73,66 +72,3 @@ def test_proposals_are_the_same_bits_in_both_forms(num_points, spread_m, num_hea
     assert (cpu.num > 0) == (num_points > 1 and num_heaps > 1)
     # The last heaps find no room for their cells, nor for their clusters.
     assert (cpu.num_runs.sum() > 3072) == (num_points > 1 and num_heaps == 150)
-
-
-# Decision.
-
-choose = parity.PerForm(sorting.select_highest, static_argnames="capacity")
-best_first = parity.PerForm(sorting.best_first)
-
-NUM_ROWS = 37
-"""No whole number of the steps of `_best_first`."""
-
-
-def scores_of(kind):
-    rng = np.random.default_rng(0)
-    score = {
-        "none": np.zeros(NUM_ROWS),
-        "one": np.arange(NUM_ROWS) == 7,
-        "the last": np.arange(NUM_ROWS) == NUM_ROWS - 1,
-        "all the same": np.ones(NUM_ROWS),
-        "ties": rng.integers(0, 5, NUM_ROWS) / 4,
-        "all different": rng.permutation(NUM_ROWS) / NUM_ROWS,
-        "some the least": np.where(rng.random(NUM_ROWS) < 0.5, LEAST, rng.random(NUM_ROWS)),
-    }
-    return score[kind].astype(np.float32)
-
-
-LEAST = 0.25
-KINDS = ("none", "one", "the last", "all the same", "ties", "all different", "some the least")
-
-
-@pytest.mark.usefixtures("platform")
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("capacity", [1, 5, NUM_ROWS, NUM_ROWS + 4])
-def test_the_highest_scores_above_the_least_are_chosen_and_of_ties_the_first(kind, capacity):
-    score = scores_of(kind)
-    row, num = choose(score, capacity=capacity, min_score=np.float32(LEAST))
-    above = np.flatnonzero(score > LEAST)
-    assert int(num) == len(above)
-    best = above[np.argsort(-score[above], kind="stable")][:capacity]
-    assert row.shape == (capacity,)
-    np.testing.assert_array_equal(row[: len(best)], np.sort(best))
-    np.testing.assert_array_equal(row[len(best) :], NUM_ROWS)
-
-
-@pytest.mark.usefixtures("platform")
-@pytest.mark.parametrize("kind", KINDS)
-def test_rows_with_a_score_come_best_first_and_of_ties_the_first_row_first(kind):
-    score = scores_of(kind)
-    num = rows.rows_in_use(jnp.asarray(score > 0))
-    expected = np.argsort(-score, kind="stable")[: np.sum(score > 0)]
-    order = best_first(score, num)
-    np.testing.assert_array_equal(order[: len(expected)], expected)
-    np.testing.assert_array_equal(order[len(expected) :], NUM_ROWS)
-
-
-@pytest.mark.usefixtures("platform")
-@pytest.mark.parametrize("size", [1, 5, 40])
-def test_rows_in_use_end_with_the_last_that_is_present(size):
-    in_use = jax.jit(functools.partial(rows.rows_in_use))
-    assert int(in_use(np.zeros(size, bool))) == 0
-    for last in range(size):
-        present = np.random.default_rng(last).random(size) < 0.3
-        present[last:] = [True] + [False] * (size - last - 1)
-        assert int(in_use(present)) == last + 1

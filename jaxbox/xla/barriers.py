@@ -12,6 +12,8 @@ from jaxbox.xla.backend import on_accelerator
 def materialize(values: Any) -> Any:
     """Has values computed once and stored, where the compiler would compute them in every reader.
 
+    Law: the identity.
+
     XLA fuses a producer into each of its consumers. A loop is a wall that fusion does not cross, even one of
     no turn: barriers keep the compiler from seeing that it has none, and that a turn would change nothing.
     (A conditional would copy what goes through it.) There are no walls on an accelerator, whose host would
@@ -36,6 +38,8 @@ def materialize(values: Any) -> Any:
 def outline(function: Callable[..., Any], *operands: Any) -> Any:
     """Calls a function in a room of its own: its scratch memory lives while it runs, and no longer.
 
+    Law: ``function(*operands)``.
+
     XLA makes constants, such as the zeros that a scatter starts from, as early as it can: those of a long
     program would all be there from its start, beside the scratch of whatever comes first. What is inside a
     conditional is made when it is needed, and stored. On an accelerator the function is simply called.
@@ -56,6 +60,8 @@ def outline(function: Callable[..., Any], *operands: Any) -> Any:
 
 def single_kernel(function: Callable[..., Any], *operands: Any) -> Any:
     """Computes a few dozen numbers in one kernel, where each would have its own.
+
+    Law: ``function(*operands)``.
 
     XLA compiles so small a loop, here of one turn, to native code on the CPU, see
     `chunks.SINGLE_KERNEL_NUMBERS`. On an accelerator the function is simply called.

@@ -57,7 +57,7 @@ RANKS = 16
 """Rows that all others are compared with in one step."""
 
 OVERLAP_TILE = 32
-"""Rows and columns of the matrix of overlaps at a time: a word of bits each row."""
+"""Rows and columns of the matrix of overlaps at a time: the bits of a word, and no other number."""
 
 OWNERS = 4096
 """Points whose detections are looked up at a time."""

@@ -116,6 +116,8 @@ class Components:
 def label_components(flags: jax.Array, row: CellGrids, *, max_runs: int) -> Components:
     """Connected components of the occupied cells of each map, with all 8 (in 3D 26) neighbours linked.
 
+    Law: `scipy.ndimage.label`, map by map.
+
     Nodes are the runs of occupied cells along a line. Where two runs on neighbouring lines touch first, one
     of them starts: so one look-up on each line before and one on each line after the start of every run find
     all links. A CPU joins runs link after link (union-find). Elsewhere the first look-up makes a forest;

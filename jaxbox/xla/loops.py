@@ -21,6 +21,8 @@ def for_chunks(
 ) -> Any:
     """Calls a step with each chunk of the rows that count, one after the other.
 
+    Law: ``for start in range(0, num_rows, chunk): state = step(start, state)``.
+
     The loop counts rows and not chunks, and without a sign: to divide, to multiply, and to look whether an
     index counts from the end would be a kernel each (XLA, CPU). On an accelerator the first chunk is done
     unasked, since its host waits for each answer: where no row counts, the step must do nothing.
@@ -52,6 +54,8 @@ def map_rows(
     function: Callable[[Any], Any], rows: Any, *, num_rows: jax.Array, chunk: int = 1, axis: int = 0
 ) -> Any:
     """Applies a batched function to the first `num_rows` rows, a chunk at a time.
+
+    Law: ``function(rows)``, on the rows that count.
 
     Work is proportional to the rows that are there, not to the capacity, and what a chunk needs
     stays in the cache. Row by row, XLA compiles the loop to native code on a CPU as long as a row reads and
@@ -117,6 +121,8 @@ def fold_rows(
     chunk: int = 1,
 ) -> Any:
     """Folds rows into a state, chunk by chunk, and skips chunks beyond the rows that count.
+
+    Law: `update` sees each row that counts once, with its index, in order.
 
     Row by row, the loop is native code on a CPU, see `map_rows`. On an accelerator all rows are one chunk.
 

@@ -30,7 +30,7 @@ def flag_cells(
         (chunk,) int32 a map.
       prepare: what is the same for all maps, of a chunk of the columns.
       columns: pytree of (N, ...) arrays.
-      num_rows: () int32; only the first so many points count.
+      num_rows: () int32; only the first so many points count, which may be more than N.
       cells: static, those of all maps.
 
     Returns:
@@ -38,6 +38,7 @@ def flag_cells(
       flags: (F,) uint8, 1 at `CellGrids.flag` of the cells.
     """
     size = jax.tree.leaves(columns)[0].shape[0]
+    num_rows = jnp.minimum(num_rows, size)  # What fills up the last chunk is no point.
     row = jnp.arange(_chunk_size(size), dtype=jnp.int32)
 
     def step(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:

@@ -76,7 +76,7 @@ def list_points(
     num_clusters: int,
     max_points: int,
 ) -> PointLists:
-    """Lists the points of each cluster.
+    """Lists the points of each cluster. Law: ``xy[row[cluster == k]]``, of the entries that count.
 
     Args:
       cluster: (E,) int32, in [0, num_clusters).
@@ -118,6 +118,8 @@ def fold_points(
     reduce: Callable[..., jax.Array] = jnp.sum,
 ) -> Any:
     """Sums up the points of many clusters, or finds what is greatest among them.
+
+    Law: `update` sees each point that counts once, with its cluster.
 
     On an accelerator it is what each point makes of the first state, reduced over the points. A CPU folds a
     few points of each cluster at a time into a wide state, with the clusters along the last axis: so all

@@ -20,7 +20,7 @@ from jaxbox.xla.loops import for_chunks, map_rows
 
 
 def prefix_sum(values: jax.Array) -> jax.Array:
-    """Inclusive prefix sum of a vector of integers.
+    """Inclusive prefix sum of a vector of integers. Law: `jnp.cumsum`.
 
     Args:
       values: (N,) bool or int32.
@@ -35,7 +35,7 @@ def prefix_sum(values: jax.Array) -> jax.Array:
 
 
 def prefix_max(values: jax.Array) -> jax.Array:
-    """The greatest up to each number of a vector of integers.
+    """The greatest up to each number of a vector of integers. Law: `jax.lax.cummax`.
 
     Args:
       values: (N,) int32, not negative.
@@ -85,7 +85,7 @@ def _sequential(
 
 
 def count_true(mask: jax.Array) -> jax.Array:
-    """How many entries of a short mask are True; see `count_each` for long ones.
+    """How many entries of a short mask are True; see `count_each` for long ones. Law: `jnp.sum`.
 
     Args:
       mask: (N,) bool, some thousand at most: a CPU takes them one by one, in one kernel instead of three.
@@ -102,7 +102,7 @@ def count_true(mask: jax.Array) -> jax.Array:
 
 
 def maximum(values: jax.Array, initial: float) -> jax.Array:
-    """The greatest of a short vector of numbers, see `count_true`.
+    """The greatest of a short vector of numbers, see `count_true`. Law: ``jnp.max(values, initial=initial)``.
 
     Args:
       values: (N,) int32 or float32, no NaN.
@@ -147,7 +147,7 @@ def _count_before(mask: jax.Array) -> jax.Array:
 
 
 def compact(mask: jax.Array, capacity: int, *, num: jax.Array | None = None) -> tuple[jax.Array, jax.Array]:
-    """Indices of the True entries, in order, at a fixed capacity.
+    """Indices of the True entries, in order, at a fixed capacity. Law: `jnp.flatnonzero`.
 
     Args:
       mask: (N,) bool, or (M, N), whose rows are gone through one after the other.
@@ -195,7 +195,7 @@ def _compact_sequential(mask: jax.Array, num: jax.Array, capacity: int) -> tuple
 
 
 def rows_in_use(present: jax.Array) -> jax.Array:
-    """How many rows there are up to the last one that is present.
+    """How many rows there are up to the last one that is present. Law: ``max(flatnonzero(present)) + 1``.
 
     Args:
       present: (N,) bool.
@@ -211,7 +211,7 @@ def rows_in_use(present: jax.Array) -> jax.Array:
 
 
 def take(rows: jax.Array, index: jax.Array, fill: Any = 0) -> jax.Array:
-    """Rows at the indices, and `fill` at the sentinel or any other index beyond.
+    """Rows at the indices, and a fill at the sentinel or any beyond. Law: ``rows[i] if i < N else fill``.
 
     Args:
       rows: (N, ...).
@@ -225,7 +225,7 @@ def take(rows: jax.Array, index: jax.Array, fill: Any = 0) -> jax.Array:
 
 
 def lookup(table: jax.Array, *index: jax.Array) -> jax.Array:
-    """Entries of a table at indices that are known to lie inside.
+    """Entries of a table at indices that are known to lie inside. Law: ``table[index]``.
 
     One flat index: several would first be joined to rows, which costs more than the look-up (XLA, CPU). A
     single entry is looked up as it is, since a loop that has another view of a table is no native one.
@@ -246,7 +246,7 @@ def lookup(table: jax.Array, *index: jax.Array) -> jax.Array:
 
 
 def split_index(index: jax.Array, size: int) -> tuple[jax.Array, jax.Array]:
-    """Row and column of flat indices into a table of rows of a size.
+    """Row and column of flat indices into a table of rows of a size. Law: `divmod`.
 
     Args:
       index: int32, not negative: `//` and `%` of numbers that may be take several times as much code.
@@ -262,7 +262,7 @@ def split_index(index: jax.Array, size: int) -> tuple[jax.Array, jax.Array]:
 
 
 def count_each(*masks: jax.Array) -> jax.Array:
-    """How many entries of each mask are True.
+    """How many entries of each mask are True. Law: `jnp.sum` of each.
 
     A sum of words counts five masks, each in bits of its own. The sums of those are of floats, since XLA
     makes a tree of kernels of each long sum of integers.
@@ -292,7 +292,7 @@ def count_each(*masks: jax.Array) -> jax.Array:
 
 
 def masked_mean(values: jax.Array, mask: jax.Array) -> jax.Array:
-    """Mean of the masked values along the last axis; 0 where there are none.
+    """Mean of the masked values along the last axis; 0 where there are none. Law: ``mean(values[mask])``.
 
     Args:
       values: (..., N) float32.
@@ -307,7 +307,7 @@ def masked_mean(values: jax.Array, mask: jax.Array) -> jax.Array:
 
 
 def masked_std(values: jax.Array, mask: jax.Array) -> jax.Array:
-    """Population standard deviation of the masked values along the last axis.
+    """Population standard deviation along the last axis. Law: ``std(values[mask])``.
 
     The mean is taken off first: E[v^2] - E[v]^2 would cancel in float32.
 

@@ -146,7 +146,7 @@ def argmax_key(value: jax.Array, index: jax.Array, num_rows: int) -> jax.Array:
 
 
 def argmax_row(key: jax.Array, num_rows: int) -> jax.Array:
-    """The index of an `argmax_key`.
+    """The index of an `argmax_key`. Law: ``argmax_row(argmax_key(value, index, n), n) == index``.
 
     Args:
       key: (...) uint32, 0 for none.

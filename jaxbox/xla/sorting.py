@@ -15,7 +15,7 @@ from jaxbox.xla.rows import compact, prefix_sum
 
 
 def largest_first(size: jax.Array, max_size: int) -> tuple[jax.Array, jax.Array]:
-    """Orders rows by descending size, keeping their order within one.
+    """Orders rows by descending size, keeping their order within one. Law: a stable sort of ``-size``.
 
     Args:
       size: (P,) int32, in [0, max_size].
@@ -37,7 +37,7 @@ def largest_first(size: jax.Array, max_size: int) -> tuple[jax.Array, jax.Array]
 def sort_by_group(
     read: Callable[[jax.Array], Any], group: jax.Array, num_rows: jax.Array, num_groups: int, *, room: int = 0
 ) -> tuple[Any, jax.Array, jax.Array]:
-    """Sorts rows by group, keeping their order within one.
+    """Sorts rows by group, keeping their order within one. Law: a stable sort of the rows that count.
 
     Args:
       read: gives the values of rows, a pytree of arrays, by their indices.
