@@ -7,6 +7,7 @@ import inspect
 import pathlib
 import pkgutil
 import re
+import tokenize
 
 import pytest
 
@@ -19,7 +20,6 @@ PROJECT = ROOT.parent
 LAYERS = [
     {"_version", "_files", "_padding", "config", "types", "geometry", "xla"},
     {"stages"},
-    {"steps"},
     {"detector"},
     {"run"},
     {"io", "evaluation", "viz", "synthetic"},
@@ -93,10 +93,10 @@ def test_imports_go_down_the_layers_only(path):
 
 def test_every_room_has_a_layer():
     rooms = {room_of(path) for path in source_files()}
-    assert rooms <= set(ALLOWED) | TOP, "a new module: say in this test where it belongs"
+    assert rooms == set(ALLOWED) | TOP, "a new module, or one that is gone: say in this test where it belongs"
 
 
-@pytest.mark.parametrize("stage", ["config", "types", "geometry", "xla", "stages", "steps", "detector"])
+@pytest.mark.parametrize("stage", ["config", "types", "geometry", "xla", "stages", "detector"])
 def test_below_the_detector_nothing_prints_reads_or_takes_the_time(stage):
     tree = ast.parse("\n".join(path.read_text() for path in source_files() if room_of(path) == stage))
     calls = {
@@ -229,3 +229,192 @@ def test_the_readme_pictures_and_links_exist_and_are_small():
 def test_the_readme_names_both_commands():
     assert "pip install . && jaxbox demo" in readme()
     assert "pip install -e '.[test]' && pytest" in readme()
+
+
+# What exists because of a compiler is in jaxbox.xla alone.
+
+STAGES = sorted((ROOT / "stages").glob("*.py"))
+PLAIN = sorted([*STAGES, *(ROOT / "geometry").glob("*.py"), ROOT / "detector.py"])
+"""Files that say what is computed, and nothing of how a compiler makes it fast."""
+
+LOOPS = {"while_loop", "fori_loop", "scan", "cond", "switch", "map"}
+FOR_A_COMPILER = {"platform_dependent", "optimization_barrier"}
+BIT_TRICKS = {
+    *("population_count", "clz", "bitcast_convert_type", "view"),
+    *("shift_left", "shift_right_logical", "shift_right_arithmetic", "left_shift", "right_shift"),
+    *(
+        "bitwise_and",
+        "bitwise_or",
+        "bitwise_xor",
+        "bitwise_count",
+        "bitwise_left_shift",
+        "bitwise_right_shift",
+    ),
+}
+COMPILER_WORDS = re.compile(
+    r"\bXLA\b|\bLLVM\b|\bkernels?\b|vectori[sz]|\bfus(?:e|es|ed|ion|ing)\b|\bnative\b|\bcompiler\b"
+)
+CHUNK_SIZE = re.compile(r"(?:\b|_)(?:CHUNKS?|TILES?|BLOCKS)(?:\b|_)")
+
+
+def relative(path):
+    return str(path.relative_to(ROOT))
+
+
+def parsed(path):
+    return ast.parse(path.read_text())
+
+
+def names_in(tree):
+    """Names and attributes that a program reads or imports: `scan` of `jax.lax.scan`."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            yield node.attr
+        elif isinstance(node, ast.Name):
+            yield node.id
+        elif isinstance(node, ast.ImportFrom):
+            yield from (alias.name for alias in node.names)
+
+
+def names_of_lax(tree):
+    """Names of `jax.lax` that a program reads or imports."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value) in ("jax.lax", "lax"):
+            yield node.attr
+        elif isinstance(node, ast.ImportFrom) and node.module == "jax.lax":
+            yield from (alias.name for alias in node.names)
+
+
+def bit_tricks(tree):
+    """What a program does with the bits of numbers; `&` of truth values is none."""
+    yield from set(names_in(tree)) & BIT_TRICKS
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.BinOp | ast.AugAssign):
+            continue
+        sides = (node.left, node.right) if isinstance(node, ast.BinOp) else (node.target, node.value)
+        of_numbers = any(
+            (isinstance(side, ast.Constant) and isinstance(side.value, int))
+            or (isinstance(side, ast.BinOp) and is_arithmetic(side.op))
+            for side in sides
+        )
+        if isinstance(node.op, ast.LShift | ast.RShift) or (of_numbers and not is_arithmetic(node.op)):
+            yield ast.unparse(node)
+
+
+def is_arithmetic(operation):
+    return not isinstance(operation, ast.BitAnd | ast.BitOr | ast.BitXor)
+
+
+def words_about(path):
+    """Comments and documentation strings of a file."""
+    with tokenize.open(path) as file:
+        for token in tokenize.generate_tokens(file.readline):
+            if token.type == tokenize.COMMENT:
+                yield token.string
+    for node in ast.walk(parsed(path)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            yield str(node.value.value)
+
+
+def constants(tree):
+    """Names of a module's constants."""
+    for node in tree.body:
+        targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+        for target in targets:
+            for name in ast.walk(target) if isinstance(target, ast.AST) else ():
+                if isinstance(name, ast.Name) and name.id.isupper():
+                    yield name.id
+
+
+def outside(*places):
+    """Source files of the package but those in some rooms, or of a name."""
+    return [
+        path for path in source_files() if not any(relative(path) == p or room_of(path) == p for p in places)
+    ]
+
+
+@pytest.mark.parametrize("path", outside("xla"), ids=relative)
+def test_loops_and_what_else_is_for_a_compiler_are_in_xla(path):
+    tree = parsed(path)
+    assert not set(names_of_lax(tree)) & LOOPS
+    if relative(path) != "run/export.py":  # It writes the programs of both platforms.
+        assert not set(names_in(tree)) & FOR_A_COMPILER
+
+
+@pytest.mark.parametrize("path", outside("xla", "run"), ids=relative)
+def test_only_xla_and_run_ask_what_a_program_is_built_for(path):
+    assert "on_accelerator" not in names_in(parsed(path))
+
+
+@pytest.mark.parametrize("path", PLAIN, ids=relative)
+def test_stages_do_nothing_with_bits_and_say_nothing_of_a_compiler(path):
+    assert list(bit_tricks(parsed(path))) == []
+    assert [words for words in words_about(path) if COMPILER_WORDS.search(words)] == []
+
+
+@pytest.mark.parametrize("path", outside("xla", "io", "cli"), ids=relative)
+def test_chunk_sizes_are_in_one_table(path):
+    # Those of `io` are of files, those of `cli` of pictures.
+    assert [name for name in constants(parsed(path)) if CHUNK_SIZE.search(name)] == []
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "xla").glob("*.py")), ids=relative)
+def test_chunk_sizes_of_xla_are_in_one_table_too(path):
+    found = [name for name in constants(parsed(path)) if CHUNK_SIZE.search(name)]
+    assert bool(found) == (path.name == "chunks.py")
+
+
+@pytest.mark.parametrize(
+    ("source", "tricks"),
+    [
+        ("a & b | (c > 1) & ~d", 0),
+        ("x: int | None = a == 1 & b", 1),
+        ("found >> 1, found & 1 == 1", 2),
+        ("a &= 3\nb <<= 2\nc |= d", 2),
+        ("n & (n - 1)", 1),
+        ("jax.lax.population_count(a) + jnp.bitwise_and(a, b)", 2),
+    ],
+)
+def test_bit_tricks_are_told_from_truth_values(source, tricks):
+    assert len(list(bit_tricks(ast.parse(source)))) == tricks
+
+
+# Stages.
+
+
+@pytest.mark.parametrize("path", STAGES, ids=relative)
+def test_stages_share_what_is_in_state_and_in_private_modules_only(path):
+    modules = {
+        (f"{node.module}.{alias.name}" if node.module == "jaxbox.stages" else node.module).split(".")[2]
+        for node in ast.walk(parsed(path))
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jaxbox.stages")
+        for alias in node.names
+    }
+    assert not {name for name in modules if name != "state" and not name.startswith("_")}
+
+
+@pytest.mark.parametrize("path", STAGES, ids=relative)
+def test_stages_pass_every_option_by_its_name(path):
+    for node in ast.walk(parsed(path)):
+        if isinstance(node, ast.Call):
+            assert all(keyword.arg is not None for keyword in node.keywords), ast.unparse(node)
+        elif isinstance(node, ast.Dict):
+            assert None not in node.keys, ast.unparse(node)
+        elif isinstance(node, ast.FunctionDef | ast.Lambda):
+            assert node.args.kwarg is None, ast.unparse(node)
+
+
+@pytest.mark.parametrize("path", outside("io"), ids=relative)
+def test_no_module_lists_the_names_of_fields(path):
+    # Those of `io` are of files.
+    assert [name for name in constants(parsed(path)) if name.endswith("_FIELDS")] == []
+
+
+def test_the_public_modules_at_the_root_are_the_types_and_the_pipeline():
+    names = {path.stem for path in ROOT.glob("*.py")}
+    assert {name for name in names if not name.startswith("_")} == {"types", "detector"}
+
+
+def test_an_oracle_reads_nothing_of_what_it_checks():
+    rooms = {room for path in (ROOT / "reference").rglob("*.py") for room in imported_rooms(path)}
+    assert rooms <= {"reference", "_version", "config", "types"}

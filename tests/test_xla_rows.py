@@ -145,6 +145,16 @@ def test_lookup_is_what_numpy_indexes(shape, places):
     np.testing.assert_array_equal(found, table[tuple(index)])
 
 
+@pytest.mark.parametrize("size", [1, 2, 1000])
+def test_a_pair_is_looked_up_as_the_number_and_the_flag(size):
+    rng = np.random.default_rng(size)
+    number, flag = rng.integers(0, 2**30, size, np.int32), rng.random(size) < 0.5
+    number[0], index = 2**30 - 1, rng.integers(0, size, (9, 7), np.int32)
+    found = rows.lookup_pair(rows.pack_pairs(jnp.asarray(number), jnp.asarray(flag)), jnp.asarray(index))
+    np.testing.assert_array_equal(found[0], number[index])
+    np.testing.assert_array_equal(found[1], flag[index])
+
+
 @pytest.mark.parametrize("size", [1, 2, 7, 2**20])
 def test_split_index_is_divmod(size):
     index = np.append(np.random.default_rng(size).integers(0, 2**31, 50), [0, size - 1, size, 2**31 - 1])

@@ -13,7 +13,7 @@ from jaxbox.xla.barriers import materialize, single_kernel
 from jaxbox.xla.components import NONE, CellGrids, label_components
 from jaxbox.xla.loops import map_rows
 from jaxbox.xla.maps import flag_cells, map_tables
-from jaxbox.xla.rows import compact, lookup, prefix_sum, take
+from jaxbox.xla.rows import compact, lookup, lookup_pair, pack_pairs, prefix_sum, take
 from jaxbox.xla.segments import reduce_segments
 
 
@@ -307,12 +307,10 @@ def _find_clusters(
     Rectangles are fitted to points between the slab's heights, or to all of the clusters with few of those.
     """
     num_clusters = fit_all.shape[0]
-    # One look-up answers both.
-    code = 2 * row + take(fit_all, row).astype(jnp.int32)
+    cluster_and_all = pack_pairs(row, take(fit_all, row))
 
     def find(component: jax.Array, in_slab: jax.Array) -> tuple[jax.Array, jax.Array]:
-        found = lookup(code, component)
-        cluster, every = found >> 1, found & 1 == 1
+        cluster, every = lookup_pair(cluster_and_all, component)
         return cluster, (cluster < num_clusters) & (in_slab | every)
 
     return map_tables(

@@ -118,7 +118,7 @@ def try_rotations(
 
 
 def _extents(clusters: PointTable, cos: jax.Array, sin: jax.Array) -> jax.Array:
-    # How far the cluster reaches along -u, u, -v and v: one kernel, and one array.
+    # How far the cluster reaches along -u, u, -v and v, in one array.
     to_x, to_y = jnp.concatenate([-cos, cos, sin, -sin]), jnp.concatenate([-sin, sin, -cos, cos])
 
     def update(reach: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:

@@ -245,6 +245,37 @@ def lookup(table: jax.Array, *index: jax.Array) -> jax.Array:
     return jnp.take(table.reshape(-1), flat, mode="clip")
 
 
+def pack_pairs(number: jax.Array, flag: jax.Array) -> jax.Array:
+    """Packs a number and a flag in one word, so that one look-up finds both. Law: see `lookup_pair`.
+
+    Args:
+      number: (N,) int32, in [0, 2^30).
+      flag: (N,) bool.
+
+    Returns:
+      (N,) int32.
+    """
+    return 2 * number + flag.astype(jnp.int32)
+
+
+def lookup_pair(pairs: jax.Array, index: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Numbers and flags that `pack_pairs` packed. Law: ``number[index], flag[index]``.
+
+    Args:
+      pairs: (N,) int32.
+      index: (...) int32, in [0, N).
+
+    Returns:
+      (...) int32 and (...) bool.
+
+    >>> pairs = pack_pairs(jnp.array([5, 7]), jnp.array([True, False]))
+    >>> [part.tolist() for part in lookup_pair(pairs, jnp.array([1, 0]))]
+    [[7, 5], [False, True]]
+    """
+    found = lookup(pairs, index)
+    return found >> 1, found & 1 == 1
+
+
 def split_index(index: jax.Array, size: int) -> tuple[jax.Array, jax.Array]:
     """Row and column of flat indices into a table of rows of a size. Law: `divmod`.
 
