@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import parity
 import pytest
-
-from jaxbox import DetectorConfig, steps
-from jaxbox.config import ComponentMap
 from jaxbox.steps import decision
 from jaxbox.steps.points import Obstacles
 from jaxbox.steps.proposals import CHUNK
+
+from jaxbox import DetectorConfig, steps
+from jaxbox.config import ComponentMap
 from jaxbox.xla import backend, masked
 
 ROOM = CHUNK + 900

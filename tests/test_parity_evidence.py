@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import parity
 import pytest
+from jaxbox.steps.boxes import complete_trials
+from jaxbox.steps.proposals import Trials
 
 from jaxbox import reference
 from jaxbox.stages import completion, evidence
-from jaxbox.steps.boxes import complete_trials
-from jaxbox.steps.proposals import Trials
 from jaxbox.types import NOT_A_BOX, Boxes, Rectangles
 
 EVIDENCE = parity.all_options(parity.CONFIG.evidence, "enabled")

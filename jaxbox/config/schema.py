@@ -232,7 +232,7 @@ class BoxConfig:
     """Closeness: points nearer to an edge than this count as on it."""
     scene_direction: bool = _static(default=True)
     """static: prefer the direction that most boxes of the sweep share; needs the evidence."""
-    direction_weight: Scalar = 0.2
+    direction_weight: Scalar = 0.1
     """Height of that preference, in closeness."""
     direction_sigma_deg: Scalar = 3.0
     """Width of the vote and of the preference: exp(-(d / sigma)^2)."""
