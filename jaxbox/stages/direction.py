@@ -62,9 +62,9 @@ def scene_preference(
 
 
 def _vote_scores(boxes: Boxes, rays: RayFractions, config: VehicleConfig) -> jax.Array:
-    """(P,) how much each voter looks like a car to the rays and by its size, at the better of its assignments.
+    """(P,) how much each voter looks like a car by rays and size, at the better of its assignments.
 
-    Fences, hedges and walls are opaque too, but longer than a car, or seen through where a car would be.
+    Fences, hedges and walls are opaque too, but longer than a car, or seen through where a car is.
     """
     prior = prior_of(config.classes, jnp.zeros(boxes.length.shape, jnp.int32))
     by_size = size_score(boxes.length, boxes.width, prior)
