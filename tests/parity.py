@@ -12,9 +12,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-from jaxbox import reference, synthetic
-from jaxbox.config import ComponentMap, DetectorConfig
 from jaxbox.reference.proposals import (
     Obstacles,
     Proposal,
@@ -23,9 +20,13 @@ from jaxbox.reference.proposals import (
     make_proposals,
     select_options,
 )
-from jaxbox.stages.evidence import BLOCK, Evidence, _free_words, _hit_words
-from jaxbox.stages.rectangles import PointLists
+
+from jaxbox import reference, synthetic
+from jaxbox.config import ComponentMap, DetectorConfig
+from jaxbox.stages.state import Evidence
 from jaxbox.xla import backend
+from jaxbox.xla.ragged import PointLists
+from jaxbox.xla.range_bits import BLOCK, covered_words, next_words
 
 NUM_SEEDS = 20
 REAL_FRAMES = ("000001", "000008", "000080", "000134", "001497")
@@ -181,8 +182,8 @@ class Case:
         # Where each free cell ends, the next begins: the compiled stage sums the two.
         changes = jnp.diff(free.reshape(-1, free.shape[2]).astype(jnp.int32), axis=0, prepend=0)
         return Evidence(
-            free=_free_words(changes.reshape(free.shape)),
-            hit=_hit_words(hits),
+            free=covered_words(changes.reshape(free.shape)),
+            hit=next_words(hits),
             support=jnp.asarray(self.evidence.support, jnp.float32),
             num_ranges=CONFIG.evidence.num_ranges,
         )

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import parity
 import pytest
+<<<<<<< HEAD
 from jaxbox.steps import decision
 from jaxbox.steps.points import Obstacles
 from jaxbox.steps.proposals import CHUNK
@@ -15,13 +16,22 @@ from jaxbox.steps.proposals import CHUNK
 from jaxbox import DetectorConfig, steps
 from jaxbox.config import ComponentMap
 from jaxbox.xla import backend, masked
+=======
+
+from jaxbox import DetectorConfig
+from jaxbox.config import ComponentMap
+from jaxbox.stages.clustering import propose_clusters
+from jaxbox.stages.state import Obstacles
+from jaxbox.xla import backend, rows, sorting
+from jaxbox.xla.chunks import MAP_POINTS as CHUNK
+>>>>>>> main
 
 ROOM = CHUNK + 900
 """Rows for obstacles: no whole number of chunks."""
 
 
 def test_a_function_per_form_keeps_the_program_of_each():
-    total = parity.PerForm(masked.prefix_sum)
+    total = parity.PerForm(rows.prefix_sum)
     values = np.arange(700, dtype=np.int32)
     loops = []
     for accelerator in (False, True, False, True):
@@ -49,9 +59,8 @@ def two_maps():
 
 @parity.PerForm
 def propose(xy, height, num_points):
-    present = jnp.arange(ROOM) < num_points
-    obstacles = Obstacles(jnp.arange(ROOM), xy, height, present, num_points, ROOM)
-    return steps.propose_clusters(obstacles, two_maps())
+    obstacles = Obstacles(jnp.arange(ROOM), xy, height, num_points, ROOM)
+    return propose_clusters(obstacles, two_maps())
 
 
 def heaps_of_points(seed, spread_m, num_heaps):
@@ -69,17 +78,17 @@ def test_proposals_are_the_same_bits_in_both_forms(num_points, spread_m, num_hea
     cpu, other = parity.in_both_forms(propose, xy, height, np.int32(num_points))
     for field in dataclasses.fields(cpu):
         one, two = getattr(cpu, field.name), getattr(other, field.name)
-        rows = slice(int(cpu.num_clusters)) if field.name in ("num_points", "low", "high") else ...
-        np.testing.assert_array_equal(one[rows], two[rows], err_msg=field.name)
-    assert (cpu.num_clusters > 0) == (num_points > 1 and num_heaps > 1)
+        kept = slice(int(cpu.num)) if field.name in ("num_points", "low", "high") else ...
+        np.testing.assert_array_equal(one[kept], two[kept], err_msg=field.name)
+    assert (cpu.num > 0) == (num_points > 1 and num_heaps > 1)
     # The last heaps find no room for their cells, nor for their clusters.
     assert (cpu.num_runs.sum() > 3072) == (num_points > 1 and num_heaps == 150)
 
 
 # Decision.
 
-choose = parity.PerForm(decision._choose, static_argnames="capacity")
-best_first = parity.PerForm(decision._best_first)
+choose = parity.PerForm(sorting.select_highest, static_argnames="capacity")
+best_first = parity.PerForm(sorting.best_first)
 
 NUM_ROWS = 37
 """No whole number of the steps of `_best_first`."""
@@ -121,7 +130,7 @@ def test_the_highest_scores_above_the_least_are_chosen_and_of_ties_the_first(kin
 @pytest.mark.parametrize("kind", KINDS)
 def test_rows_with_a_score_come_best_first_and_of_ties_the_first_row_first(kind):
     score = scores_of(kind)
-    num = masked.rows_in_use(jnp.asarray(score > 0))
+    num = rows.rows_in_use(jnp.asarray(score > 0))
     expected = np.argsort(-score, kind="stable")[: np.sum(score > 0)]
     order = best_first(score, num)
     np.testing.assert_array_equal(order[: len(expected)], expected)
@@ -131,7 +140,7 @@ def test_rows_with_a_score_come_best_first_and_of_ties_the_first_row_first(kind)
 @pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("size", [1, 5, 40])
 def test_rows_in_use_end_with_the_last_that_is_present(size):
-    in_use = jax.jit(functools.partial(masked.rows_in_use))
+    in_use = jax.jit(functools.partial(rows.rows_in_use))
     assert int(in_use(np.zeros(size, bool))) == 0
     for last in range(size):
         present = np.random.default_rng(last).random(size) < 0.3

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_masked import count_loops
+from native_loops import count_loops
 
 from jaxbox import DetectorConfig, PointCloud, Status, detect, stack_clouds, synthetic
 from jaxbox.config import BoxConfig, EvidenceConfig

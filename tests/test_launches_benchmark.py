@@ -12,7 +12,7 @@ import pytest
 from benchmarks import bench_launches, compile_ahead, hlo_text, launch_model, loop_turns, xla_dump
 from benchmarks.launch_model import Counts, Turns
 from benchmarks.xla_dump import Thunk
-from jaxbox import DetectorConfig, PointCloud
+from jaxbox import DetectorConfig, PointCloud, detector
 from jaxbox.run import compiled
 from jaxbox.xla.backend import building_for
 
@@ -349,7 +349,7 @@ def count_sorted(tally):
 @pytest.fixture
 def named(monkeypatch):
     """Names loops by their lines of this file."""
-    monkeypatch.setattr(compiled, "__file__", __file__.replace(pathlib.Path(__file__).name, "detector.py"))
+    monkeypatch.setattr(detector, "__file__", __file__.replace(pathlib.Path(__file__).name, "detector.py"))
 
 
 @pytest.mark.parametrize("number", [0, 1, 5, 1000])

@@ -17,12 +17,14 @@ from test_detector import CAPACITY, assert_same_bits, run
 from test_projection import make_calibration, oracle_uvw
 
 from jaxbox import DetectorConfig, PointCloud, Status, detect, detect_batch, io, stack_clouds, synthetic
+from jaxbox.config import BoxConfig
 from jaxbox.config.fields import config_from_toml, config_to_toml
 from jaxbox.evaluation import pairwise_overlaps
 from jaxbox.geometry.projection import project_boxes
 from jaxbox.io.kitti import KittiObject
 from jaxbox.stages.hull import convex_hulls, polygon_area
-from jaxbox.stages.rectangles import PointLists, best_rectangles, try_rotations
+from jaxbox.stages.rectangles import best_rectangles, try_rotations
+from jaxbox.xla.ragged import PointLists
 from quality import bad_input
 
 SWEEPS = settings(max_examples=max(settings.default.max_examples // 5, 1))
@@ -62,8 +64,10 @@ def hull_of(xy):
 @jax.jit
 def _rectangle(rows, count):
     lists = PointLists(rows[:, 0], rows[:, 1], jnp.zeros(1, jnp.int32), count[None], NUM_POINTS)
-    first, options = jnp.zeros(1, jnp.int32), {"num_angles": NUM_ANGLES, "min_distance_m": 0.05}
-    curve, extents = try_rotations(lists, first, jnp.int32(1), criterion="area", **options)
+    first = jnp.zeros(1, jnp.int32)
+    curve, extents = try_rotations(
+        lists, first, jnp.int32(1), BoxConfig(criterion="area", num_angles=NUM_ANGLES)
+    )
     return best_rectangles(curve, extents, jnp.zeros(NUM_ANGLES))
 
 

@@ -11,13 +11,14 @@ import jax.numpy as jnp
 import numpy as np
 import parity
 import pytest
-from test_masked import count_loops
+from native_loops import count_loops
 
-from jaxbox import DetectorConfig, reference, steps
+from jaxbox import DetectorConfig, detector, reference
 from jaxbox.config import HullConfig
-from jaxbox.stages import descriptors, hull
-from jaxbox.stages import rectangles as box
+from jaxbox.stages import descriptors, direction, hull, rectangles
+from jaxbox.xla import chunks
 from jaxbox.xla.loops import map_rows
+from jaxbox.xla.ragged import PointLists
 
 SETTINGS = parity.CONFIG.box
 CRITERIA = ("area", "variance", "closeness", "visible_closeness")
@@ -54,8 +55,8 @@ def convex_hulls(points, valid, num_clusters):
 
 
 polygon_area = jax.jit(hull.polygon_area)
-try_rotations = parity.PerForm(box.try_rotations, static_argnames=("criterion", "num_angles"))
-scene_preference = parity.PerForm(box.scene_preference, static_argnames="num_angles")
+try_rotations = parity.PerForm(rectangles.try_rotations)
+count_votes = parity.PerForm(direction.count_votes)
 point_moments = parity.PerForm(descriptors.point_moments)
 shape_descriptors = jax.jit(descriptors.shape_descriptors)
 
@@ -257,11 +258,11 @@ def test_extreme_points_lose_at_most_a_slice_of_the_hull(cases):
 @pytest.mark.usefixtures("platform")
 def test_what_a_list_holds_beyond_its_end_joins_no_cluster():
     rng = np.random.default_rng(0)
-    size, num = hull.CHUNK_POINTS + 900, hull.CHUNK_POINTS + 300
+    size, num = chunks.HULL_POINTS + 900, chunks.HULL_POINTS + 300
     xy = jnp.asarray(rng.normal(size=(size, 2)), jnp.float32)
     slot = jnp.asarray(rng.integers(0, parity.MAX_CLUSTERS, size))
     row, origin = jnp.arange(size), jnp.zeros((parity.MAX_CLUSTERS, 2))
-    whole = 2 * hull.CHUNK_POINTS - num
+    whole = 2 * chunks.HULL_POINTS - num
     listed = (
         jnp.pad(slot[:num], (0, whole), constant_values=parity.MAX_CLUSTERS),
         jnp.pad(row[:num], (0, whole)),
@@ -291,12 +292,11 @@ def fits_of(cases):
 def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, criterion):
     options = {"num_angles": SETTINGS.num_angles, "min_distance_m": SETTINGS.min_distance_m}
     points, count, fits = fits_of(cases)
-    curves, extents = try_rotations(*fits, criterion=criterion, **options)
-    rectangles = jax.tree.map(
-        np.asarray, box.best_rectangles(curves, extents, jnp.zeros(SETTINGS.num_angles))
-    )
+    curves, extents = try_rotations(*fits, dataclasses.replace(SETTINGS, criterion=criterion))
+    best = rectangles.best_rectangles(curves, extents, jnp.zeros(SETTINGS.num_angles))
+    angle, low, high = (np.asarray(values) for values in (best.angle, best.low, best.high))
     curves, extents = np.asarray(curves).T, np.stack(extents).transpose(2, 1, 0)
-    angles = np.round(rectangles.angle / (math.pi / 2 / SETTINGS.num_angles)).astype(int)
+    angles = np.round(angle / (math.pi / 2 / SETTINGS.num_angles)).astype(int)
     wrong = worse = 0
     for k in range(len(count)):
         xy = points[k, : count[k]].astype(float)
@@ -305,7 +305,7 @@ def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, cr
         scale = 1 if "closeness" in criterion else max(np.ptp(expected), 0.1)
         wrong += np.sum(np.abs(curves[k] - expected) > 1e-3 * scale)
         worse += expected[angles[k]] < expected.max() - 1e-3 * scale
-        best = np.stack([rectangles.low[k], rectangles.high[k]], axis=1).reshape(4)
+        best = np.stack([low[k], high[k]], axis=1).reshape(4)
         parity.assert_within(best - bounds[angles[k]], 3e-5, "m of the best extents")
     # Which of two equally near edges faces the sensor, or is nearest to a point, may round either way.
     parity.assert_share(wrong, len(count) * SETTINGS.num_angles, 1e-3, f"curve {criterion}")
@@ -315,7 +315,7 @@ def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, cr
 @pytest.mark.usefixtures("platform")
 def test_smallest_area_is_that_of_opencv_within_the_bound_of_the_step(cases):
     points, count, fits = fits_of(cases)
-    curve, _ = try_rotations(*fits, criterion="area", num_angles=SETTINGS.num_angles, min_distance_m=0.05)
+    curve, _ = try_rotations(*fits, dataclasses.replace(SETTINGS, criterion="area"))
     step = math.pi / 2 / SETTINGS.num_angles
     for k in range(len(count)):
         _, (length, width), _ = reference.min_area_rectangle(points[k, : count[k]])
@@ -329,9 +329,9 @@ def test_smallest_area_is_that_of_opencv_within_the_bound_of_the_step(cases):
 @pytest.mark.parametrize("criterion", CRITERIA)
 def test_a_cluster_without_points_has_no_extents_and_a_finite_curve(criterion):
     x, y = jnp.array([1.0, 2, 3]), jnp.array([1.0, 1, 2])
-    lists = box.PointLists(x, y, start=jnp.array([0, 3]), total=jnp.array([3, 0]), max_points=16)
-    options = {"criterion": criterion, "num_angles": 6, "min_distance_m": 0.05}
-    curve, extents = try_rotations(lists, jnp.arange(2), jnp.int32(2), **options)
+    lists = PointLists(x, y, start=jnp.array([0, 3]), total=jnp.array([3, 0]), max_points=16)
+    config = dataclasses.replace(SETTINGS, criterion=criterion, num_angles=6)
+    curve, extents = try_rotations(lists, jnp.arange(2), jnp.int32(2), config)
     u0, u1, v0, v1 = extents
     assert np.isfinite(curve).all()
     np.testing.assert_array_equal([(u1 - u0)[0, 0], (v1 - v0)[0, 0]], [2, 1])
@@ -354,7 +354,7 @@ def test_scene_direction_is_that_of_the_reference():
             **options,
         )
         rows = (parity.pad(value, 16) for value in (yaw, extent, num_points, voting))
-        preference = scene_preference(*rows, weight=SETTINGS.direction_weight, **options)
+        preference = count_votes(*rows, SETTINGS)
         parity.assert_within(preference - expected, 1e-4, "preference")
 
 
@@ -372,7 +372,7 @@ def test_scene_direction_of_sweeps_is_that_of_the_reference(cases):
         rows = (
             parity.pad(value, parity.MAX_CLUSTERS) for value in (yaw, extent, num_points, extent >= least)
         )
-        preference = scene_preference(*rows, weight=0.2, **options)
+        preference = count_votes(*rows, SETTINGS)
         assert direction == np.argmax(np.asarray(preference))
 
 
@@ -429,16 +429,16 @@ def test_a_hull_beyond_its_capacity_is_fitted_to_by_its_own_vertices():
     away = np.array([10, 0])
     xy = jnp.float32(np.concatenate([disc + away, disc - away]))
     obstacles = types.SimpleNamespace(xy=xy, count=jnp.int32(len(xy)))
-    proposals = types.SimpleNamespace(
-        cluster=jnp.repeat(jnp.arange(2), 40)[None],
+    clusters = types.SimpleNamespace(
+        of_point=jnp.repeat(jnp.arange(2), 40)[None],
         num_points=jnp.array([40, 40]),
-        num_clusters=jnp.int32(2),
+        num=jnp.int32(2),
         low=jnp.array([[9.0, -1], [-11, -1]]),
         high=jnp.array([[11.0, 1], [-9, 1]]),
     )
-    fits = jax.jit(lambda: steps.fit_rectangles(obstacles, proposals, config))()
-    assert int(fits.hull_vertices) == 40
-    assert fits.points.count.tolist() == [4, 4]
-    x, _, _ = fits.points.table(jnp.arange(2))
+    outlines, _ = jax.jit(lambda: detector.fit_rectangles(obstacles, clusters, config))()
+    assert int(outlines.hull_vertices) == 40
+    assert outlines.points.count.tolist() == [4, 4]
+    x, _, _ = outlines.points.table(jnp.arange(2))
     assert (x[:, 0] > 8).all()
     assert (x[:, 1] < -8).all()

@@ -1,5 +1,6 @@
 """Parity with the reference: warp, cells, components, clusters, samples; exact, on equal inputs."""
 
+import dataclasses
 import functools
 
 import jax
@@ -7,15 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import parity
 import pytest
+from native_loops import count_loops
 from scipy import ndimage
-from test_masked import count_loops
 
 from jaxbox import reference
 from jaxbox.config import ComponentMap, DetectorConfig
 from jaxbox.reference.clusters import NO_CLUSTER
-from jaxbox.stages import clustering, selection
-from jaxbox.stages import rectangles as box
-from jaxbox.xla import backend
+from jaxbox.stages import clustering
+from jaxbox.xla import backend, chunks, ragged
+from jaxbox.xla.components import NONE, STRIP_WORDS, CellGrids, _prefix, label_components
 
 SETTINGS = parity.CONFIG.clustering
 WARP = {"start_m": SETTINGS.adaptive_start_m, "growth": SETTINGS.adaptive_growth}
@@ -29,19 +30,24 @@ MAX_RUNS = 2**14
 def label_cells(cells, *, row, max_runs):
     """Components of the maps' cells, (maps, N), and what else is known of them."""
     flags = jnp.zeros(row.num_flags, jnp.uint8).at[row.flag(cells)].set(1)
-    components = clustering.label_components(flags, row, max_runs=max_runs)
+    components = label_components(flags, row, max_runs=max_runs)
     return components.at(cells), components
 
 
-@functools.partial(parity.PerForm, static_argnames="max_clusters")
-def select_clusters(component, xy, height, in_slab, first, *, max_clusters, **gates):
-    statistics = selection.find_statistics(
+@parity.PerForm
+def select_clusters(component, xy, height, in_slab, first, config, min_extent_m):
+    statistics = clustering.find_statistics(
         component, height.size, xy, height, in_slab, max_components=MAX_RUNS
     )
-    return selection.select_clusters(statistics, first, max_clusters=max_clusters, **gates)
+    return clustering.select_clusters(statistics, first, config, min_extent_m=min_extent_m)
 
 
-list_points = parity.PerForm(box.list_points, static_argnames=("num_clusters", "max_points"))
+def with_room(config, sizes):
+    """The configuration with maps of these capacities for clusters."""
+    return dataclasses.replace(config, maps=tuple(ComponentMap(max_clusters=size) for size in sizes))
+
+
+list_points = parity.PerForm(ragged.list_points, static_argnames=("num_clusters", "max_points"))
 
 
 def cell_options(component_map: ComponentMap):
@@ -68,7 +74,7 @@ def test_statistics_are_those_of_the_first_points_on_every_platform(num_points):
     component[1] += 40
     xyz, in_slab = rng.normal(size=(1000, 3)).astype(np.float32), rng.random(1000) < 0.5
     points = component, jnp.int32(num_points), xyz[:, :2], xyz[:, 2], in_slab
-    statistics = selection.find_statistics(*map(jnp.asarray, points), max_components=81)
+    statistics = clustering.find_statistics(*map(jnp.asarray, points), max_components=81)
     for i in range(81):
         member = (component == i)[:, :num_points].any(axis=0)
         own = xyz[:num_points][member]
@@ -79,7 +85,7 @@ def test_statistics_are_those_of_the_first_points_on_every_platform(num_points):
 
 
 def test_warped_points_are_those_of_the_reference(cases):
-    warp = jax.jit(functools.partial(clustering.warp_range))
+    warp = jax.jit(functools.partial(clustering.compress_range))
     for case in cases:
         xy = case.obstacles.xyz[:, :2]
         for growth in (0.0, WARP["growth"], 0.1):
@@ -90,11 +96,9 @@ def test_warped_points_are_those_of_the_reference(cases):
 
 def test_cells_are_those_of_the_reference(cases):
     maps = list(MAPS.values())
-    row = clustering.arrange_cells([m.cell_m for m in maps], [m.num_levels for m in maps], **parity.REGION)
-    limits = {f"{end}_height_m": [getattr(m, f"{end}_height_m") for m in maps] for end in ("min", "max")}
-    find = functools.partial(
-        clustering.find_cells, row=row, cell_m=[m.cell_m for m in maps], **limits, **parity.REGION
-    )
+    config = dataclasses.replace(SETTINGS, maps=tuple(maps))
+    row = clustering.arrange_grids(config, parity.CONFIG.region)
+    find = functools.partial(clustering.find_cells, grids=row, config=config, region=parity.CONFIG.region)
     for case in cases:
         xy, height = case.obstacles.xyz[:, :2].astype(np.float32), case.obstacles.height.astype(np.float32)
         padded = [parity.pad(values, parity.MAX_OBSTACLES) for values in (xy, height)]
@@ -105,10 +109,10 @@ def test_cells_are_those_of_the_reference(cases):
             )
             assert shape == row.shapes[i]
             member = (height > component_map.min_height_m) & (height < component_map.max_height_m)
-            expected = np.where(member, in_row(cells, row, i), clustering.NONE)
+            expected = np.where(member, in_row(cells, row, i), NONE)
             cell = np.asarray(found[i])
-            assert (cell[len(xy) :] == clustering.NONE).all()
-            assert ((cell == clustering.NONE)[: len(xy)] == ~member).all()
+            assert (cell[len(xy) :] == NONE).all()
+            assert ((cell == NONE)[: len(xy)] == ~member).all()
             # A point on the edge of a cell may round either way; KITTI keeps whole millimetres, so of points
             # on a grid of 35 cm one in 175 lies on an edge.
             differ = cell[: len(xy)] != expected
@@ -121,7 +125,7 @@ def test_cells_are_those_of_the_reference(cases):
 def test_components_are_exactly_those_of_the_reference(cases):
     for case in cases:
         grids = [reference.grid_cells(*members_of(case, m), **cell_options(m)) for m in MAPS.values()]
-        row = clustering.CellRow(tuple(shape for _, shape in grids))
+        row = CellGrids(tuple(shape for _, shape in grids))
         cells = [
             parity.pad(in_row(cells, row, i), parity.MAX_OBSTACLES) for i, (cells, _) in enumerate(grids)
         ]
@@ -130,7 +134,7 @@ def test_components_are_exactly_those_of_the_reference(cases):
         for i, (cells, shape) in enumerate(grids):
             expected = reference.label_components(cells, shape)
             np.testing.assert_array_equal(component[i, : len(cells)], first[i] + expected)
-            assert (component[i, len(cells) :] == clustering.NONE).all()
+            assert (component[i, len(cells) :] == NONE).all()
             assert int(components.num_runs[i]) == reference.count_runs(cells, shape)
             assert first[i + 1] - first[i] == expected.max() + 1 > 20
 
@@ -149,7 +153,7 @@ SHAPES = {
 def test_components_of_random_grids_are_those_of_scipy_on_every_platform(name):
     # From single cells to one component, past the density at which paths are longest.
     rng = np.random.default_rng(0)
-    row = clustering.CellRow(SHAPES[name])
+    row = CellGrids(SHAPES[name])
     size = max(np.prod(shape) for shape in SHAPES[name])
     for density in np.linspace(0.02, 0.6, 25):
         grids = [rng.random(shape) < density for shape in SHAPES[name]]
@@ -202,7 +206,7 @@ def comb(bits):
 
 
 LONG_WAYS = {"spiral": spiral(71), "snake": snake(71), "comb": comb(6), "comb on its side": comb(4).T}
-LONG_ROW = clustering.CellRow(((72, 256, 1),))
+LONG_ROW = CellGrids(((72, 256, 1),))
 
 
 def label_grid(grid, label=label_cells):
@@ -237,8 +241,8 @@ def test_the_first_rounds_are_not_enough_for_the_comb(monkeypatch):
 @pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("num_strips", [1, 2, 9])
 def test_counts_of_words_are_summed_up_strip_after_strip_on_every_platform(num_strips):
-    count = np.random.default_rng(num_strips).integers(0, 17, (clustering.STRIP_WORDS, num_strips), np.int32)
-    before, total = jax.jit(functools.partial(clustering._prefix))(count)
+    count = np.random.default_rng(num_strips).integers(0, 17, (STRIP_WORDS, num_strips), np.int32)
+    before, total = jax.jit(functools.partial(_prefix))(count)
     expected = np.cumsum(count.T).reshape(num_strips, -1).T - count
     np.testing.assert_array_equal(before, expected)
     assert int(total) == count.sum()
@@ -247,7 +251,7 @@ def test_counts_of_words_are_summed_up_strip_after_strip_on_every_platform(num_s
 @pytest.mark.codegen
 @pytest.mark.parametrize("name", SHAPES)
 def test_a_cpu_joins_runs_in_native_loops(name):
-    row = clustering.CellRow(SHAPES[name])
+    row = CellGrids(SHAPES[name])
     cells = jnp.zeros((len(row.shapes), 9), jnp.int32)
     num_loops, num_native = count_loops(label_cells.jitted, cells, row=row, max_runs=MAX_RUNS)
     assert num_native == num_loops > 2 * max(map(len, row.lines_back))
@@ -256,27 +260,27 @@ def test_a_cpu_joins_runs_in_native_loops(name):
 @pytest.mark.codegen
 @pytest.mark.parametrize("num_maps", [1, 4, 5, 9])
 def test_a_cpu_finds_statistics_in_native_loops(num_maps):
-    find = jax.jit(selection.find_statistics, static_argnames="max_components")
+    find = jax.jit(clustering.find_statistics, static_argnames="max_components")
     component = jnp.zeros((num_maps, 9), jnp.int32)
     points = component, jnp.int32(9), jnp.zeros((9, 2)), jnp.zeros(9), jnp.zeros(9, bool)
     num_loops, num_native = count_loops(find, *points, max_components=MAX_RUNS)
-    assert num_native == num_loops == -(-num_maps // selection.MAPS_PER_LOOP)
+    assert num_native == num_loops == -(-num_maps // chunks.STATISTICS_MAPS)
 
 
 @pytest.mark.usefixtures("platform")
 def test_runs_beyond_the_capacity_belong_to_no_component():
     cells = np.stack([np.arange(0, 400, 2) % 20, np.arange(0, 400, 2) // 20 * 2, np.zeros(200)], axis=1)
-    row = clustering.CellRow(((20, 40, 1),))
+    row = CellGrids(((20, 40, 1),))
     cells = in_row(cells.astype(np.int32), row, 0)[None]
     for capacity in (201, 200, 1):
         component, components = label_cells(cells, row=row, max_runs=capacity)
         assert int(components.num_runs[0]) == 200
-        assert (np.asarray(component) == clustering.NONE).sum() == max(201 - capacity, 0)
+        assert (np.asarray(component) == NONE).sum() == max(201 - capacity, 0)
 
 
 @pytest.mark.usefixtures("platform")
 def test_runs_beyond_the_capacity_join_nothing():
-    row = clustering.CellRow(((20, 40, 1),))
+    row = CellGrids(((20, 40, 1),))
     # The third touches the first, and nothing the second.
     cells = in_row(np.array([[0, 1, 0], [0, 30, 0], [1, 0, 0]], np.int32), row, 0)[None]
     for capacity, expected in ((4, [1, 2, 1]), (3, [1, 2, 0]), (2, [1, 0, 0])):
@@ -297,8 +301,8 @@ def test_clusters_that_pass_the_gates_are_exactly_those_of_the_reference(cases, 
             parity.pad(height, parity.MAX_OBSTACLES),
             parity.pad(in_slab, parity.MAX_OBSTACLES),
             np.array([1, 2 + component.max()]),
-            max_clusters=(parity.MAX_CLUSTERS,),
-            **GATES,
+            with_room(SETTINGS, [parity.MAX_CLUSTERS]),
+            parity.CONFIG.vehicles.min_extent_m,
         )
         clusters = parity.on_host(clusters)
         expected = np.where(slot == NO_CLUSTER, parity.MAX_CLUSTERS, slot)
@@ -324,10 +328,10 @@ def test_the_lists_of_the_maps_join_without_gaps_and_end_at_their_capacities():
         ((4, 4, 4), {1: 0, 3: 1, 4: 2, 5: 3, 6: 4, 8: 5, 9: 6}),
         ((2, 1, 3), {1: 0, 3: 1, 5: 2, 8: 3, 9: 4}),
     ):
-        clusters = select_clusters(
-            component[None], xy, np.zeros(11), np.ones(11, bool), np.array([1, 5, 7, 10]), max_clusters=sizes,
-            min_points=1.0, min_extent_m=0.0, max_extent_m=12.0,
-        )  # fmt: skip
+        config = with_room(dataclasses.replace(SETTINGS, min_points=1.0, max_extent_m=12.0), sizes)
+        first = np.array([1, 5, 7, 10])
+        points = component[None], xy, np.zeros(11, np.float32), np.ones(11, bool)
+        clusters = select_clusters(*points, first, config, 0.0)
         none = sum(sizes)
         assert clusters.found.tolist() == [3, 2, 2]
         assert clusters.kept.tolist() == np.minimum([3, 2, 2], sizes).tolist()

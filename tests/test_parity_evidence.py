@@ -2,47 +2,40 @@
 
 import functools
 import math
+import types
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import parity
 import pytest
-from jaxbox.steps.boxes import complete_trials
-from jaxbox.steps.proposals import Trials
 
 from jaxbox import reference
-from jaxbox.stages import completion, evidence
-from jaxbox.types import NOT_A_BOX, Boxes, Rectangles
+from jaxbox.stages import _assignments, completion, evidence
+from jaxbox.stages.state import NOT_A_BOX, Boxes, ClassHypotheses, Rectangles
+from jaxbox.xla import range_bits
 
-EVIDENCE = parity.all_options(parity.CONFIG.evidence, "enabled")
-RANGE_CELL_M = parity.CONFIG.evidence.range_cell_m
-SIDES = parity.select_options(
-    parity.CONFIG.completion, "seen_length", "seen_width", "seen_weight", "length_margin_m", "width_margin_m"
-)
+EVIDENCE = parity.CONFIG.evidence
 NUM_RAYS = parity.CONFIG.completion.num_rays
-SIZES = ("length_m", "width_m")
-LIMITS = ("max_length_m", "max_width_m")
 
-build_evidence = parity.PerForm(
-    evidence.build_evidence, static_argnames=("num_azimuths", "num_ranges", "range_cell_m")
-)
+build_evidence = parity.PerForm(evidence.build_evidence)
 ground_support = jax.jit(evidence.ground_support)
 
 
 @parity.PerForm
 def cast_rays(seen, boxes):
-    center, (length, width, yaw) = boxes[:, :2], boxes[:, 2:].T
-    options = {"num_rays": NUM_RAYS, "range_cell_m": RANGE_CELL_M}
-    return evidence.cast_rays(seen, center, length, width, yaw, **options)
+    length, width, yaw = boxes[:, 2:].T
+    flat = types.SimpleNamespace(center=boxes[:, :2], length=length, width=width, yaw=yaw)
+    return evidence.cast_rays(seen, flat, EVIDENCE, num_rays=NUM_RAYS)
 
 
 @parity.PerForm
 def complete(readings, points, seen, number):
     """Every cluster tried as one class."""
     cluster = jnp.arange(parity.MAX_CLUSTERS)
-    trials = Trials(cluster, jnp.full_like(cluster, number), points.start.shape[0])
-    return complete_trials(trials, readings, points, seen, parity.CONFIG)[0]
+    hypotheses = ClassHypotheses(cluster, jnp.full_like(cluster, number), points.start.shape[0])
+    cast = functools.partial(evidence.cast_rays, seen, config=EVIDENCE)
+    return completion._complete_by_evidence(hypotheses, readings, points, cast, parity.CONFIG)[0]
 
 
 def random_boxes(count, rng):
@@ -54,27 +47,29 @@ def random_boxes(count, rng):
 
 @parity.PerForm
 def pack_words(beams, hits):
-    return evidence._free_words(beams), evidence._hit_words(hits)
+    return range_bits.covered_words(beams), range_bits.next_words(hits)
 
 
 @pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("num_blocks", [1, 2, 21])
 def test_words_hold_the_sums_of_all_cells_before_and_the_next_hit_beyond(num_blocks):
     num_azimuths, rng = 12, np.random.default_rng(num_blocks)
-    shape = num_blocks, evidence.BLOCK, num_azimuths
-    cell = np.arange(num_blocks * evidence.BLOCK)[:, None]
+    shape = num_blocks, range_bits.BLOCK, num_azimuths
+    cell = np.arange(num_blocks * range_bits.BLOCK)[:, None]
     for share in (0.0, 0.01, 0.1, 1.0):
         hits = rng.random((len(cell), num_azimuths)) < share
         beams = rng.integers(-1, 2, hits.shape, np.int32) * hits
         free, hit = map(np.asarray, pack_words(beams.reshape(shape), hits.reshape(shape)))
         is_free = np.cumsum(beams, axis=0) > 0
-        np.testing.assert_array_equal(evidence.flagged_cells(free), is_free)
-        np.testing.assert_array_equal(evidence.flagged_cells(hit), hits)
-        before = np.cumsum(is_free, axis=0)[:: evidence.BLOCK] - is_free[:: evidence.BLOCK]
-        np.testing.assert_array_equal(free >> evidence.BLOCK, before)
-        next_hit = np.minimum.accumulate(np.where(hits, cell, evidence.NEVER)[::-1])[::-1]
-        beyond = np.append(next_hit[evidence.BLOCK :: evidence.BLOCK], [[evidence.NEVER] * num_azimuths], 0)
-        np.testing.assert_array_equal(hit >> evidence.BLOCK, beyond)
+        np.testing.assert_array_equal(range_bits.flagged_cells(free), is_free)
+        np.testing.assert_array_equal(range_bits.flagged_cells(hit), hits)
+        before = np.cumsum(is_free, axis=0)[:: range_bits.BLOCK] - is_free[:: range_bits.BLOCK]
+        np.testing.assert_array_equal(free >> range_bits.BLOCK, before)
+        next_hit = np.minimum.accumulate(np.where(hits, cell, range_bits.NEVER)[::-1])[::-1]
+        beyond = np.append(
+            next_hit[range_bits.BLOCK :: range_bits.BLOCK], [[range_bits.NEVER] * num_azimuths], 0
+        )
+        np.testing.assert_array_equal(hit >> range_bits.BLOCK, beyond)
 
 
 @pytest.mark.usefixtures("platform")
@@ -86,9 +81,9 @@ def test_evidence_differs_in_few_cells_only(cases):
             parity.pad(case.height, parity.CAPACITY),
             parity.pad(case.inlier, parity.CAPACITY),
             -case.plane[2],
-            **EVIDENCE,
+            EVIDENCE,
         )
-        hit, free = (evidence.flagged_cells(np.asarray(words)) for words in (ours.hit, ours.free))
+        hit, free = (range_bits.flagged_cells(np.asarray(words)) for words in (ours.hit, ours.free))
         hits, frees = (parity.flagged(sums).T for sums in (case.evidence.hit_sums, case.evidence.free_sums))
         other_support = np.asarray(ours.support) != case.evidence.support
         parity.assert_share(np.sum(other_support), 200**2, 2e-3, "support")
@@ -133,10 +128,6 @@ def rectangles_of(proposals, angles):
     low, high = extents[:, [0, 2]], extents[:, [1, 3]]
     rows = np.column_stack([low, high, np.array(angles) * math.pi / 2 / 90, worth])
     return Rectangles(parity.pad(rows, parity.MAX_CLUSTERS))
-
-
-def prior_of(vehicle, *names):
-    return {name: jnp.full(parity.MAX_CLUSTERS, getattr(vehicle, name)) for name in names}
 
 
 def rows_of(boxes: Boxes, expected):
@@ -189,11 +180,15 @@ def test_completed_boxes_are_those_of_the_reference(cases, number):
 @pytest.mark.parametrize("mode", ["away", "none"])
 def test_boxes_without_evidence_are_those_of_the_reference(cases, mode):
     vehicle = parity.CONFIG.vehicles.classes[0]
-    if mode == "none":
-        stage = functools.partial(completion.keep_measured, **prior_of(vehicle, *LIMITS))
-    else:
-        stage = functools.partial(completion.extend_away, **prior_of(vehicle, *SIZES, *LIMITS), **SIDES)
-    stage = jax.jit(lambda rectangles, stage=stage: stage(completion.longer_side(rectangles)))
+    prior = jax.tree.map(lambda value: jnp.full(parity.MAX_CLUSTERS, value), vehicle)
+
+    @jax.jit
+    def stage(rectangles):
+        sides = _assignments.longer_side(rectangles)
+        if mode == "none":
+            return _assignments.keep_measured(sides, prior)
+        return _assignments.extend_away(sides, prior, parity.CONFIG.completion)
+
     for case in cases:
         angles = [int(np.argmax(p.curve)) for p in case.proposals]
         expected = [
@@ -202,4 +197,4 @@ def test_boxes_without_evidence_are_those_of_the_reference(cases, mode):
         boxes = parity.on_host(stage(rectangles_of(case.proposals, angles)))
         ours, theirs = rows_of(boxes, expected)
         parity.assert_within((ours - theirs)[:, :-1], 1e-4, f"boxes {mode}")
-        assert np.all(ours[:, -1] == completion.CERTAIN)
+        assert np.all(ours[:, -1] == _assignments.CERTAIN)

@@ -1,6 +1,6 @@
 """Parity with the reference: filter, ground plane, ground surface, heights; each on equal inputs."""
 
-import functools
+import dataclasses
 
 import jax
 import numpy as np
@@ -8,41 +8,30 @@ import parity
 import pytest
 
 from jaxbox import reference
+from jaxbox.config import RegionConfig
 from jaxbox.stages import filtering, ground
 
 FILTER = parity.all_options(parity.CONFIG.filtering, "enabled")
 GROUND = parity.CONFIG.ground
 CANDIDATE_HALF = {"half_x_m": GROUND.candidate_half_x_m, "half_y_m": GROUND.candidate_half_y_m}
 MAX_CANDIDATES = 3200
-RANSAC = parity.select_options(
-    GROUND, "num_hypotheses", "num_refits", "tolerance_m", "max_slope_deg", "min_inlier_fraction"
-)
-STATIC_FILTER = ("half_x_m", "half_y_m", "cell_m", "num_levels", "num_iterations")
-STATIC_SURFACE = ("cell_m", "half_m", "num_envelope_rounds")
 
-filter_outliers = parity.PerForm(filtering.filter_outliers, static_argnames=STATIC_FILTER)
-cell_minima = jax.jit(functools.partial(ground.cell_minima, **CANDIDATE_HALF))
-fit_ground_plane = parity.PerForm(
-    functools.partial(ground.fit_ground_plane, **RANSAC),
-    static_argnames=("num_hypotheses", "num_refits"),
-)
-fit_ground_surface = jax.jit(ground.fit_ground_surface, static_argnames=STATIC_SURFACE)
-
-
-@jax.jit
-def height_above_ground(xyz, planes, surface):
-    height = ground.height_above_planes(xyz, planes, tolerance_m=GROUND.min_height_m)
-    return height - ground.surface_height(surface, xyz[:, :2], **parity.SURFACE_GRID)
+filter_outliers = parity.PerForm(filtering.filter_outliers)
+cell_minima = jax.jit(ground.cell_minima)
+fit_ground_plane = parity.PerForm(ground.fit_ground_plane)
+fit_ground_surface = jax.jit(ground.fit_ground_surface)
+height_above_ground = jax.jit(ground.height_above_ground)
 
 
 @pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("changes", [{}, {"num_std": 1.5, "min_density": 3.0, "bandwidth_m": 0.7}])
 def test_filter_keeps_the_points_that_the_reference_keeps(cases, changes):
     options = parity.REGION | FILTER | changes
+    config = dataclasses.replace(parity.CONFIG.filtering, **changes)
     for case in cases:
         expected = reference.filter_outliers(case.xyz, **options)
         xyz1 = np.pad(case.xyz, ((0, 0), (0, 1)), constant_values=1)
-        keep = np.asarray(filter_outliers(parity.pad(xyz1, parity.CAPACITY), **options))
+        keep = np.asarray(filter_outliers(parity.pad(xyz1, parity.CAPACITY), config, parity.CONFIG.region))
         assert 0 < (~expected).sum() < len(expected) / 3
         assert not keep[len(case.xyz) :].any()
         # A centroid, or a distance, on the very edge of a cell, or of the threshold, may round either way.
@@ -53,7 +42,7 @@ def test_filter_keeps_the_points_that_the_reference_keeps(cases, changes):
 def test_cell_minima_are_those_of_the_reference(cases):
     for case in cases:
         mask = parity.pad(case.inlier, parity.CAPACITY)
-        candidates, occupied = cell_minima(parity.pad(case.xyz, parity.CAPACITY), mask)
+        candidates, occupied = cell_minima(parity.pad(case.xyz, parity.CAPACITY), mask, GROUND)
         candidates, occupied = np.asarray(candidates), np.asarray(occupied)
         # Both go through the cells in row-major order; a point on the edge of a cell may round into either.
         np.testing.assert_array_equal(candidates[occupied][:, :2], case.candidates[:, :2])
@@ -69,6 +58,7 @@ def test_planes_of_different_draws_agree_where_one_has_decisive_support(cases):
             parity.pad(case.candidates, MAX_CANDIDATES),
             parity.padded_mask(len(case.candidates), MAX_CANDIDATES),
             jax.random.key(number),
+            GROUND,
         )
         ours, theirs = np.asarray(plane.coefficients, float), case.plane.astype(float)
         support, their_support = (
@@ -93,10 +83,11 @@ def test_planes_of_different_draws_agree_where_one_has_decisive_support(cases):
 @pytest.mark.parametrize("wider", [0.5, 1, 2])
 def test_surface_is_that_of_the_reference_on_the_same_plane(cases, wider):
     options = parity.SURFACE | {"smoothing_m": wider * parity.SURFACE["smoothing_m"]}
+    config = dataclasses.replace(GROUND, smoothing_m=options["smoothing_m"])
     for case in cases:
         xyz = parity.pad(case.xyz, parity.CAPACITY)
         mask = parity.pad(case.inlier, parity.CAPACITY)
-        surface = np.asarray(fit_ground_surface(xyz, mask, case.plane, **options))
+        surface = np.asarray(fit_ground_surface(xyz, mask, case.plane, config))
         inliers = case.xyz[case.inlier].astype(float)
         expected = reference.fit_ground_surface(inliers, case.plane, **options)
         # A point on the edge of a cell may round into either: that moves the ground a little, round about.
@@ -113,7 +104,7 @@ def test_heights_are_those_of_the_reference_on_one_plane_and_on_two(cases):
             expected = reference.height_above_ground(
                 xyz, planes, case.surface, **parity.SURFACE_GRID, min_height_m=GROUND.min_height_m
             )
-            height = height_above_ground(parity.pad(case.xyz, parity.CAPACITY), planes, case.surface)
+            height = height_above_ground(parity.pad(case.xyz, parity.CAPACITY), planes, case.surface, GROUND)
             differ = np.asarray(height)[: len(xyz)] - expected
             # 6e-5 on the border of the grid only: the compiled stage stops a thousandth of a cell short.
             parity.assert_within(differ, 6e-5, f"m of heights over {len(planes)} planes")
@@ -121,7 +112,8 @@ def test_heights_are_those_of_the_reference_on_one_plane_and_on_two(cases):
 
 def test_what_rounding_puts_past_the_last_cell_is_no_minimum_of_another():
     xyz = np.tile(np.array([[2.1, 0, -9]], np.float32), (8, 1))
-    _, occupied = ground.cell_minima(xyz, np.ones(8, bool), half_x_m=2.2, half_y_m=2.2)
+    config = dataclasses.replace(GROUND, candidate_half_x_m=2.2, candidate_half_y_m=2.2)
+    _, occupied = ground.cell_minima(xyz, np.ones(8, bool), config)
     assert not occupied.any()
 
 
@@ -151,10 +143,12 @@ CROWDS = crowds()
 @pytest.mark.parametrize("crowd", CROWDS)
 def test_the_plane_is_the_same_in_both_forms(crowd, num_hypotheses, num_refits):
     xyz = CROWDS[crowd]
-    options = {"num_hypotheses": num_hypotheses, "num_refits": num_refits, "min_inlier_fraction": 0.02}
+    config = dataclasses.replace(
+        GROUND, num_hypotheses=num_hypotheses, num_refits=num_refits, min_inlier_fraction=0.02
+    )
     points = parity.pad(xyz, 1024), parity.padded_mask(len(xyz), 1024)
     for seed in range(3):
-        plane, other = parity.in_both_forms(fit_ground_plane, *points, jax.random.key(seed), **options)
+        plane, other = parity.in_both_forms(fit_ground_plane, *points, jax.random.key(seed), config)
         assert (plane.found, plane.num_inliers) == (other.found, other.num_inliers)
         np.testing.assert_allclose(plane.coefficients, other.coefficients, rtol=0, atol=1e-5)
         assert plane.found or crowd not in ("many", "two levels") or num_hypotheses == 1
@@ -163,9 +157,9 @@ def test_the_plane_is_the_same_in_both_forms(crowd, num_hypotheses, num_refits):
 @pytest.mark.parametrize("crowd", CROWDS)
 def test_the_filter_keeps_the_same_points_in_both_forms(crowd):
     xyz = CROWDS[crowd]
-    options = FILTER | {"half_x_m": 16.0, "half_y_m": 12.0}
+    region = RegionConfig(half_x_m=16.0, half_y_m=12.0)
     xyz1 = parity.pad(np.pad(xyz, ((0, 0), (0, 1)), constant_values=1), 1024)
-    keep, other = parity.in_both_forms(filter_outliers, xyz1, **options)
+    keep, other = parity.in_both_forms(filter_outliers, xyz1, parity.CONFIG.filtering, region)
     np.testing.assert_array_equal(keep, other)
     assert not keep[len(xyz) :].any()
     assert keep.any() == (len(xyz) > 2)

@@ -1,5 +1,6 @@
 """Parity with the reference: points round boxes, scores, overlap and suppression, on equal inputs."""
 
+import dataclasses
 import functools
 
 import jax
@@ -10,42 +11,30 @@ import pytest
 
 from jaxbox import reference
 from jaxbox.geometry import planar
-from jaxbox.stages import scoring as vehicles
+from jaxbox.stages import scoring
+from jaxbox.stages.state import Obstacles
 from jaxbox.xla import backend
 
 SETTINGS = parity.CONFIG.vehicles
-AROUND = parity.select_options(SETTINGS, "margin_m", "ring_m", "upper_height_m", "stray_share")
+AROUND = parity.select_options(SETTINGS, "margin_m", "ring_m", "upper_height_m", "top_quantile")
 SCORE = parity.select_options(
     SETTINGS,
     *("top_grade", "min_extent_m", "saturation_points", "sparseness_power", "free_scale", "ring_weight"),
     *("overhead_weight", "support_points", "objective_gate", "objective_softness"),
-    *("recess_share", "upright_worth"),
+    *("recess_share", "upright_score"),
 )
-SURROUNDINGS_SCORE = {
-    name: SCORE[name]
-    for name in ("top_grade", "ring_weight", "overhead_weight", "recess_share", "upright_worth")
-}
-EVIDENCE_SCORE = {
-    name: SCORE[name]
-    for name in SCORE
-    if name
-    in (
-        "saturation_points",
-        "sparseness_power",
-        "free_scale",
-        "support_points",
-        "objective_gate",
-        "objective_softness",
-    )
-}
-HEIGHTS = ("height_m", "height_below_m", "height_above_m", "min_height_m", "max_height_m")
 MAX_BOXES = 1024
 NUM_RANDOM = 300
 
-count_points_around = parity.PerForm(
-    functools.partial(vehicles.count_points_around, **parity.REGION, **AROUND)
-)
-suppress = parity.PerForm(vehicles.suppress)
+
+@parity.PerForm
+def count_points_around(boxes, tops, recess, num_boxes, xy, height, num_points):
+    prior = dataclasses.replace(SETTINGS.classes[0], count_max_height_m=tops, recess_m=recess)
+    obstacles = Obstacles(jnp.arange(len(xy)), xy, height, jnp.int32(num_points), len(xy))
+    return scoring.count_points_around(boxes, prior, num_boxes, obstacles, SETTINGS, parity.CONFIG.region)
+
+
+non_max_suppression = parity.PerForm(scoring.non_max_suppression)
 rectangle_iou = jax.jit(jax.vmap(planar.rectangle_iou))
 
 
@@ -124,34 +113,21 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
 
 @jax.jit
 def score_boxes(columns, prior):
-    around = vehicles.Surroundings(jnp.stack(columns["around"], axis=1))
+    around = scoring.NeighbourhoodCounts(jnp.stack(columns["around"], axis=1))
     size = jnp.stack([columns["length"], columns["width"]], axis=1)
-    early = vehicles.evidence_score(
-        **{name: columns[name] for name in ("num_points", "hit", "free_length", "support", "objective")},
-        **EVIDENCE_SCORE,
-    )
-    sizes = vehicles.size_score(
-        size,
-        jnp.stack([prior["length_m"], prior["width_m"]], axis=1),
-        **{name: prior[name] for name in ("length_below_m", "length_above_m", "width_tolerance_m")},
-    )
-    late = vehicles.surroundings_score(
-        around,
-        columns["rho"],
-        **{name: prior[name] for name in HEIGHTS},
-        **SURROUNDINGS_SCORE,
-    )
-    return early * sizes * late * prior["prior_weight"]
+    seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "objective"))
+    early = scoring.evidence_score(*seen, SETTINGS)
+    late = scoring.neighbourhood_score(around, columns["rho"], prior, SETTINGS)
+    return early * scoring.size_score(size, prior) * late * prior.prior_weight
 
 
 def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
     rng = np.random.default_rng(0)
     label = rng.integers(0, 3, MAX_BOXES)
-    names = parity.all_options(SETTINGS.classes[0])
-    prior = {name: np.array([getattr(SETTINGS.classes[k], name) for k in label]) for name in names}
+    prior = jax.tree.map(lambda *values: np.array(values)[label], *SETTINGS.classes)
     columns = {
-        "length": prior["length_m"] + rng.normal(0, 0.7, MAX_BOXES),
-        "width": prior["width_m"] + rng.normal(0, 0.2, MAX_BOXES),
+        "length": prior.length_m + rng.normal(0, 0.7, MAX_BOXES),
+        "width": prior.width_m + rng.normal(0, 0.2, MAX_BOXES),
         "num_points": rng.integers(1, 300, MAX_BOXES),
         "hit": rng.uniform(0, 1, MAX_BOXES),
         "free_length": rng.uniform(0, 0.2, MAX_BOXES) ** 2,
@@ -160,7 +136,7 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
         "rho": rng.uniform(2, 80, MAX_BOXES),
         "around": [
             rng.integers(1, 400, MAX_BOXES),
-            prior["height_m"] + rng.normal(0, 0.5, MAX_BOXES),
+            prior.height_m + rng.normal(0, 0.5, MAX_BOXES),
             rng.integers(0, 20, MAX_BOXES),
             rng.integers(0, 20, MAX_BOXES),
             upper := rng.integers(0, 20, MAX_BOXES),
@@ -214,7 +190,7 @@ def test_suppression_keeps_the_boxes_that_the_reference_keeps(cases):
         boxes = boxes[rng.permutation(len(boxes))]
         kept = reference.suppress(boxes.astype(float), scores, max_overlap=SETTINGS.max_overlap)
         expected = np.isin(np.arange(len(boxes)), kept)
-        keep = suppress(
+        keep = non_max_suppression(
             parity.pad(boxes, MAX_BOXES),
             parity.padded_mask(len(boxes), MAX_BOXES),
             max_overlap=SETTINGS.max_overlap,
@@ -251,7 +227,7 @@ def test_chains_and_heaps_of_boxes_are_suppressed_as_by_the_reference(heap, room
     boxes = HEAPS[heap]
     scores = np.arange(len(boxes), 0, -1) / 100
     kept = reference.suppress(boxes.astype(float), scores, max_overlap=SETTINGS.max_overlap)
-    keep = suppress(
+    keep = non_max_suppression(
         parity.pad(boxes, room), parity.padded_mask(len(boxes), room), max_overlap=SETTINGS.max_overlap
     )
     np.testing.assert_array_equal(np.flatnonzero(keep), np.sort(kept))
@@ -262,7 +238,9 @@ def test_the_chains_are_longer_than_the_rounds_without_a_look(monkeypatch):
     boxes = HEAPS["a chain"]
     monkeypatch.setattr(jax.lax, "while_loop", lambda _, __, state: state)
     with backend.building_for(accelerator=True):
-        keep = vehicles.suppress(boxes, jnp.ones(len(boxes), bool), max_overlap=SETTINGS.max_overlap)
+        keep = scoring.non_max_suppression(
+            boxes, jnp.ones(len(boxes), bool), max_overlap=SETTINGS.max_overlap
+        )
     assert not np.array_equal(np.flatnonzero(keep), np.arange(0, len(boxes), 2))
 
 

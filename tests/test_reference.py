@@ -59,7 +59,7 @@ SCORE = options(
     VehicleConfig(),
     *("top_grade", "min_extent_m", "saturation_points", "sparseness_power", "free_scale", "ring_weight"),
     *("overhead_weight", "support_points", "objective_gate", "objective_softness"),
-    *("recess_share", "upright_worth"),
+    *("recess_share", "upright_score"),
 )
 AROUND = {
     "margin_m": 0.1,
@@ -69,7 +69,7 @@ AROUND = {
     "max_height_m": 4.0,
     "recess_m": 0.3,
     "upper_height_m": 0.9,
-    "stray_share": 0.0,
+    "top_quantile": 0.0,
 }
 
 
@@ -667,8 +667,8 @@ def test_upper_points_behind_the_faces_are_recessed():
 
 def test_a_few_stray_returns_above_a_roof_are_not_its_top():
     roof = np.random.default_rng(0).uniform(0.3, 1.5, 400)
-    options = {"max_height_m": 2.2, "stray_share": 0.01}
-    highest = options | {"stray_share": 0.0}
+    options = {"max_height_m": 2.2, "top_quantile": 0.01}
+    highest = options | {"top_quantile": 0.0}
     assert top_of(roof, **highest) == roof.max()
     clean = top_of(roof, **options)
     assert abs(clean - np.quantile(roof, 0.99)) < 0.02

@@ -98,10 +98,7 @@ def synthetic_ground_height():
 def test_the_share_of_inliers_is_of_as_many_candidates_as_the_ground_has():
     config = DetectorConfig().ground
     candidates, _ = jax.eval_shape(
-        lambda xyz: ground.cell_minima(
-            xyz, jnp.ones(4, bool), half_x_m=config.candidate_half_x_m, half_y_m=config.candidate_half_y_m
-        ),
-        jnp.zeros((4, 3)),
+        lambda xyz: ground.cell_minima(xyz, jnp.ones(4, bool), config), jnp.zeros((4, 3))
     )
     assert summary._num_candidates(DetectorConfig()) == candidates.shape[0]
     assert summary._num_candidates(DetectorConfig.paper()) == DetectorConfig.paper().ground.num_candidates

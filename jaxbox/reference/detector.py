@@ -221,7 +221,7 @@ def _vertical(
     options = _surface_grid(config) | select_options(config.ground, "min_height_m")
     place = np.append(candidate.completed.box[:2], z)[None]
     ground_z = ground_elevation(place, ground.planes, ground.grid, **options)[0]
-    if not config.vehicles.surroundings:
+    if not config.vehicles.neighbourhood:
         bottom, top = candidate.proposal.bottom_m, candidate.proposal.top_m
         return ground_z + (bottom + top) / 2, top - bottom
     prior = config.vehicles.classes[candidate.label]

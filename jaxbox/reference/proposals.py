@@ -327,7 +327,7 @@ def _judge(
         "ring_weight",
     )
     names += ("overhead_weight", "support_points", "objective_gate", "objective_softness")
-    names += ("recess_share", "upright_worth")
+    names += ("recess_share", "upright_score")
     score = score_box(
         box,
         prior,
@@ -346,7 +346,7 @@ def _look_around(
     proposal: Proposal, box: np.ndarray, prior: Any, obstacles: Obstacles, config: Any
 ) -> PointsAround:
     vehicles = config.vehicles
-    if not vehicles.surroundings:
+    if not vehicles.neighbourhood:
         return PointsAround(inside=len(proposal.members), top_m=proposal.top_m, overhead=0, ring=0)
     assert obstacles.tree is not None
     near = obstacles.tree.query_ball_point(box[:2], np.hypot(box[2], box[3]) / 2 + 2 * vehicles.ring_m)
@@ -354,7 +354,7 @@ def _look_around(
         box,
         obstacles.xyz[near],
         obstacles.height[near],
-        **select_options(vehicles, "margin_m", "ring_m", "upper_height_m", "stray_share"),
+        **select_options(vehicles, "margin_m", "ring_m", "upper_height_m", "top_quantile"),
         **select_options(config.ground, "min_height_m", "max_height_m"),
         count_max_height_m=prior.count_max_height_m,
         recess_m=prior.recess_m,

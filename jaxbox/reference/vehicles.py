@@ -65,7 +65,7 @@ def count_points_around(
     max_height_m: float,
     recess_m: float,
     upper_height_m: float,
-    stray_share: float,
+    top_quantile: float,
 ) -> PointsAround:
     """Counts the points in and round a box.
 
@@ -80,7 +80,7 @@ def count_points_around(
       max_height_m: and from this on they are left out.
       recess_m: recessed points lie farther than this behind each face that the sensor sees.
       upper_height_m: points higher than this are glass, bonnet and roof.
-      stray_share: share of the points inside that may lie above the top.
+      top_quantile: share of the points inside that may lie above the top.
 
     Returns:
       The counts.
@@ -92,7 +92,7 @@ def count_points_around(
     upper = within & counted & (height > upper_height_m)
     return PointsAround(
         inside=int((within & counted).sum()),
-        top_m=top_of(height[within & counted], count_max_height_m, stray_share),
+        top_m=top_of(height[within & counted], count_max_height_m, top_quantile),
         overhead=int((within & above).sum()),
         ring=int((~within & (outside < ring_m) & counted).sum()),
         upper=int(upper.sum()),
@@ -100,13 +100,13 @@ def count_points_around(
     )
 
 
-def top_of(height: np.ndarray, max_height_m: float, stray_share: float) -> float:
+def top_of(height: np.ndarray, max_height_m: float, top_quantile: float) -> float:
     """The height that a share of the points of a vehicle exceed, so that a stray return is no roof.
 
     Args:
       height: (n,) m above the ground, below the next.
       max_height_m: highest that they may have; points above 0.4 of it are counted in 20 levels.
-      stray_share: of the points; those of a level count as spread evenly over it.
+      top_quantile: of the points; those of a level count as spread evenly over it.
 
     Returns:
       m; at most the highest, and that where no point is in a level.
@@ -114,7 +114,7 @@ def top_of(height: np.ndarray, max_height_m: float, stray_share: float) -> float
     if len(height) == 0:
         return 0.0
     edges = np.linspace(LOWEST_LEVEL * max_height_m, max_height_m, NUM_LEVELS + 1)
-    left = stray_share * len(height)
+    left = top_quantile * len(height)
     counts, _ = np.histogram(height, edges)
     for count, low, high in zip(counts[::-1], edges[-2::-1], edges[:0:-1], strict=True):
         if count > left:
@@ -166,7 +166,7 @@ def score_box(
     objective_gate: float,
     objective_softness: float,
     recess_share: float,
-    upright_worth: float,
+    upright_score: float,
 ) -> float:
     """How much a box looks like a vehicle of a class: a product of factors in [0, 1].
 
@@ -191,8 +191,8 @@ def score_box(
       support_points: factor min(1, (support + 1/2) / this).
       objective_gate: factor 1 / (1 + exp(-(J - gate) / softness)).
       objective_softness: see there.
-      recess_share: factor from `upright_worth`, where no upper point is recessed, to 1 from this share on.
-      upright_worth: see there.
+      recess_share: factor from `upright_score`, where no upper point is recessed, to 1 from this share on.
+      upright_score: see there.
 
     Returns:
       The score; 0 where a gate of the class closes.
@@ -212,7 +212,7 @@ def score_box(
     clutter = ring_weight * around.ring + overhead_weight * around.overhead
     score *= np.exp(-clutter / max(around.inside, 1))
     share = (around.recessed + DOUBT_POINTS * recess_share) / (around.upper + DOUBT_POINTS)
-    score *= upright_worth + (1 - upright_worth) * min(1.0, share / recess_share)
+    score *= upright_score + (1 - upright_score) * min(1.0, share / recess_share)
     if support is not None:
         score *= min(1.0, (support + 0.5) / support_points)
     return float(score * expit((objective - objective_gate) / objective_softness))
