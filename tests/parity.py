@@ -12,6 +12,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from jaxbox import reference, synthetic
+from jaxbox.config import ComponentMap, DetectorConfig
 from jaxbox.reference.proposals import (
     Obstacles,
     Proposal,
@@ -20,9 +23,6 @@ from jaxbox.reference.proposals import (
     make_proposals,
     select_options,
 )
-
-from jaxbox import reference, synthetic
-from jaxbox.config import ComponentMap, DetectorConfig
 from jaxbox.stages.state import Evidence
 from jaxbox.xla import backend
 from jaxbox.xla.ragged import PointLists

@@ -8,15 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import parity
 import pytest
-<<<<<<< HEAD
-from jaxbox.steps import decision
-from jaxbox.steps.points import Obstacles
-from jaxbox.steps.proposals import CHUNK
-
-from jaxbox import DetectorConfig, steps
-from jaxbox.config import ComponentMap
-from jaxbox.xla import backend, masked
-=======
 
 from jaxbox import DetectorConfig
 from jaxbox.config import ComponentMap
@@ -24,7 +15,6 @@ from jaxbox.stages.clustering import propose_clusters
 from jaxbox.stages.state import Obstacles
 from jaxbox.xla import backend, rows, sorting
 from jaxbox.xla.chunks import MAP_POINTS as CHUNK
->>>>>>> main
 
 ROOM = CHUNK + 900
 """Rows for obstacles: no whole number of chunks."""
