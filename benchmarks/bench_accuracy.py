@@ -7,8 +7,8 @@ one, so a difference between two settings is judged by their mean next to their 
     python -m benchmarks.bench_accuracy --copies 6 --set vehicles.max_overlap=0.2 --json accuracy.json
     python -m benchmarks.bench_accuracy --data kitti_object_more
 
-Settings were chosen on the 20 frames of ``kitti_object``; those of ``kitti_object_more`` had no say. Frames of
-one drive resemble each other: the noise of a figure is that over drives drawn again (bootstrap).
+Settings were chosen on the 20 frames of ``kitti_object``; those of ``kitti_object_more`` had no say. Frames
+of one drive resemble each other: the noise of a figure is that over drives drawn again (bootstrap).
 """
 
 import argparse
@@ -167,7 +167,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         nargs="+",
         default=["kitti_object"],
         metavar="FOLDER",
-        help="labelled sets; several are pooled",
+        help="labelled sets, pooled",
     )
     parser.add_argument("--draws", type=int, default=100, help="draws of the bootstrap over drives")
     parser.add_argument(

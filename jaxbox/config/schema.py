@@ -149,8 +149,8 @@ class ClusteringConfig:
     """
 
     maps: tuple[ComponentMap, ...] = (
-        ComponentMap(cell_m=0.2, max_cells=7168),
-        ComponentMap(cell_m=0.1, max_cells=10240, min_height_m=0.3, max_height_m=2.0),
+        ComponentMap(cell_m=0.2, max_cells=9216),
+        ComponentMap(cell_m=0.1, max_cells=14336, min_height_m=0.3, max_height_m=2.0),
         ComponentMap(cell_m=0.5, max_cells=4096),
     )
     """The component maps; the first also gives the scene direction and the components for display."""
