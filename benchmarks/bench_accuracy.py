@@ -148,7 +148,7 @@ def print_report(
 
 
 def drives_of(options: argparse.Namespace, frames: Sequence[Frame]) -> dict[str, str] | None:
-    """The drive of each frame: of the file that is named, else of those that lie in the folders of the data."""
+    """The drive of each frame: of the named file, or else of the files in the folders of the data."""
     names = [frame.name for frame in frames]
     if options.drives is not None:
         return read_drives(options.drives, names)
