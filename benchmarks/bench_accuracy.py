@@ -5,6 +5,10 @@ the input by a few degrees moves it as much. Turned and mirrored copies are as g
 one, so a difference between two settings is judged by their mean next to their spread.
 
     python -m benchmarks.bench_accuracy --copies 6 --set vehicles.max_overlap=0.2 --json accuracy.json
+    python -m benchmarks.bench_accuracy --data kitti_object_more
+
+Settings were chosen on the 20 frames of ``kitti_object``; those of ``kitti_object_more`` had no say. Frames
+of one drive resemble each other: the noise of a figure is that over drives drawn again (bootstrap).
 """
 
 import argparse
@@ -103,6 +107,26 @@ def mean_rows(tables: Sequence[Mapping[str, Mapping[str, float]]]) -> dict[str, 
     }
 
 
+def drive_noise(
+    labels: kitti.Objects, results: kitti.Objects, drives: Mapping[str, str], *, num_draws: int
+) -> dict[str, float]:
+    """Standard deviation of 3D and BEV AP moderate and SOFT over drives drawn again with replacement."""
+    rng = np.random.default_rng(0)
+    members: dict[str, list[str]] = {}
+    for name in labels:
+        members.setdefault(drives[name], []).append(name)
+    rows = []
+    for _ in range(num_draws):
+        drawn = rng.choice(sorted(members), len(members))
+        # A drive that is drawn twice is two drives.
+        names = [(name, f"{name}/{i}") for i, drive in enumerate(drawn) for name in members[drive]]
+        some = {new: labels[name] for name, new in names}, {new: results[name] for name, new in names}
+        evaluation = kitti.evaluate(*some, min_overlap=MIN_OVERLAP, metrics=METRICS)
+        row = {f"{c.metric} moderate": c.r40 for c in evaluation.curves if c.difficulty == "moderate"}
+        rows.append(row | {"SOFT": kitti.soft_score(*some)})
+    return {key: float(np.std([row[key] for row in rows])) for key in rows[0]}
+
+
 def print_report(
     by_copy: Mapping[str, Mapping[str, Any]], summary: Mapping[str, Mapping[str, float]]
 ) -> None:
@@ -123,29 +147,53 @@ def print_report(
     common.print_table(["", *kept], [[row, *(errors[key] for key in kept)] for row, errors in table.items()])
 
 
+def drives_of(options: argparse.Namespace, frames: Sequence[Frame]) -> dict[str, str] | None:
+    """The drive of each frame: of the named file, or else of the files in the folders of the data."""
+    names = [frame.name for frame in frames]
+    if options.drives is not None:
+        return read_drives(options.drives, names)
+    files = [common.data_folder(name) / "drives.txt" for name in options.data]
+    if not all(file.is_file() for file in files):
+        return None
+    rows = [line.split("#")[0].split() for file in files for line in file.read_text().splitlines()]
+    return {row[0]: row[1] for row in rows if row and row[0] in set(names)}
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = common.parser(__doc__ or "")
     parser.add_argument("--copies", type=int, default=len(COPIES), choices=range(1, len(COPIES) + 1))
+    parser.add_argument(
+        "--data",
+        nargs="+",
+        default=["kitti_object"],
+        metavar="FOLDER",
+        help="labelled sets, pooled",
+    )
+    parser.add_argument("--draws", type=int, default=100, help="draws of the bootstrap over drives")
     parser.add_argument(
         "--drives", type=pathlib.Path, metavar="FILE", help='a table by drive too; one "frame drive" a line'
     )
     options: argparse.Namespace = parser.parse_args(arguments)
     config = common.chosen_config(options)
-    sweeps = open_sweeps(common.data_folder("kitti_object"))
+    sweeps = [sweep for name in options.data for sweep in open_sweeps(common.data_folder(name))]
     frames = [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
     labels = {frame.name: frame.labels for frame in frames}
     num_points = {frame.name: label_points(frame) for frame in frames}
-    drives = None if options.drives is None else read_drives(options.drives, labels)
-    by_copy, statuses, by_drive = {}, [], []
+    drives = drives_of(options, frames)
+    by_copy, statuses, by_drive, noise = {}, [], [], {}
     for copy in COPIES[: options.copies]:
         results, bits = detect_frames(frames, copy, config)
         by_copy[copy.name] = measure(labels, results, num_points)
         statuses += bits
         if drives is not None:
             by_drive.append(measure_drives(labels, results, drives))
+            noise = noise or drive_noise(labels, results, drives, num_draws=options.draws)
     summary = summarise(by_copy)
     print_report(by_copy, summary)
     found: dict[str, Any] = {"num_frames": len(frames), "copies": by_copy, "summary": summary}
+    if noise:
+        found |= {"num_drives": len(set((drives or {}).values())), "noise_over_drives": noise}
+        print("\nsd over drives drawn again: " + ", ".join(f"{k} {v:.1f}" for k, v in noise.items()))
     if by_drive:
         found["by_drive"] = rows = mean_rows(by_drive)
         print(

@@ -149,8 +149,8 @@ class ClusteringConfig:
     """
 
     maps: tuple[ComponentMap, ...] = (
-        ComponentMap(cell_m=0.2, max_cells=7168),
-        ComponentMap(cell_m=0.1, max_cells=10240, min_height_m=0.3, max_height_m=2.0),
+        ComponentMap(cell_m=0.2, max_cells=9216),
+        ComponentMap(cell_m=0.1, max_cells=14336, min_height_m=0.3, max_height_m=2.0),
         ComponentMap(cell_m=0.5, max_cells=4096),
     )
     """The component maps; the first also gives the scene direction and the components for display."""
@@ -232,7 +232,7 @@ class BoxConfig:
     """Closeness: points nearer to an edge than this count as on it."""
     scene_direction: bool = _static(default=True)
     """static: prefer the direction that most boxes of the sweep share; needs the evidence."""
-    direction_weight: Scalar = 0.2
+    direction_weight: Scalar = 0.1
     """Height of that preference, in closeness."""
     direction_sigma_deg: Scalar = 3.0
     """Width of the vote and of the preference: exp(-(d / sigma)^2)."""

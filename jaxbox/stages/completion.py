@@ -22,6 +22,7 @@ from jaxbox.stages._assignments import (
     longer_side,
     place,
 )
+from jaxbox.stages._priors import prior_of
 from jaxbox.stages.state import (
     NOT_A_BOX,
     Boxes,
@@ -32,7 +33,6 @@ from jaxbox.stages.state import (
     RayFractions,
     Rectangles,
     longest_side,
-    prior_of,
 )
 from jaxbox.xla import chunks
 from jaxbox.xla.arithmetic import fast_max, fast_min

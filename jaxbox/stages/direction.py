@@ -5,15 +5,16 @@ import functools
 import jax
 import jax.numpy as jnp
 
-from jaxbox.config import BoxConfig, DetectorConfig
+from jaxbox.config import BoxConfig, DetectorConfig, VehicleConfig
 from jaxbox.stages._assignments import NUM_ASSIGNMENTS, assign_length_axis, extend_away
-from jaxbox.stages.state import NOT_A_BOX, Boxes, CastRays, Clusters, Rectangles, longest_side, prior_of
+from jaxbox.stages._priors import prior_of, size_score
+from jaxbox.stages.state import NOT_A_BOX, Boxes, CastRays, Clusters, RayFractions, Rectangles, longest_side
 from jaxbox.xla import chunks
 from jaxbox.xla.loops import fold_rows, map_rows
 from jaxbox.xla.rows import compact, rows_in_use, take
 
 VOTE_POINTS, VOTE_EXTENT_M = 150.0, 6.0
-"""A vote for the scene direction counts min(points, 150) x min(extent, 6 m)."""
+"""A vote for the scene's direction counts min(points, 150) x min(extent, 6 m) x the score as a car."""
 
 
 def scene_preference(
@@ -48,17 +49,34 @@ def scene_preference(
     one_list = jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), boxes)
     cast = functools.partial(cast_rays, num_rays=config.completion.num_final_rays)
     rays = map_rows(cast, one_list, num_rows=num * NUM_ASSIGNMENTS, chunk=chunks.RAYS)
-    free_length = rays.free_length.reshape(boxes.objective.shape)
-    free = jnp.min(jnp.where(boxes.objective > NOT_A_BOX, free_length, jnp.inf), axis=1)
+    rays = jax.tree.map(lambda a: a.reshape(boxes.objective.shape), rays)
+
+    def rate(rows: tuple[Boxes, RayFractions]) -> jax.Array:
+        return _vote_scores(*rows, config.vehicles)
+
+    score = map_rows(rate, (boxes, rays), num_rows=num)
+    free = jnp.min(jnp.where(boxes.objective > NOT_A_BOX, rays.free_length, jnp.inf), axis=1)
     voting = (jnp.arange(size, dtype=jnp.int32) < num) & (free <= config.box.direction_max_free)
     num_points = take(clusters.num_points, cluster)
-    return count_votes(voters.angle, longest_side(voters), num_points, voting, config.box)
+    return count_votes(voters.angle, longest_side(voters), num_points, score, voting, config.box)
+
+
+def _vote_scores(boxes: Boxes, rays: RayFractions, config: VehicleConfig) -> jax.Array:
+    """(P,) how much each voter looks like a car by rays and size, at the better of its assignments.
+
+    Fences, hedges and walls are opaque too, but longer than a car, or seen through where a car is.
+    """
+    prior = prior_of(config.classes, jnp.zeros(boxes.length.shape, jnp.int32))
+    by_size = size_score(boxes.length, boxes.width, prior)
+    score = rays.hit * jnp.exp(-((rays.free_length / config.free_scale) ** 2)) * by_size
+    return jnp.max(jnp.where(boxes.objective > NOT_A_BOX, score, 0), axis=1)
 
 
 def count_votes(
     yaw: jax.Array,
     extent: jax.Array,
     num_points: jax.Array,
+    score: jax.Array,
     voting: jax.Array,
     config: BoxConfig,
 ) -> jax.Array:
@@ -68,6 +86,7 @@ def count_votes(
       yaw: (K,) float32, rad, of the voting boxes.
       extent: (K,) float32, m, the longest measured extent of each.
       num_points: (K,) int32.
+      score: (K,) float32, in [0, 1], how much each looks like a car.
       voting: (K,) bool.
       config: A angles, the height of the preference, and the width of a vote.
 
@@ -88,7 +107,7 @@ def count_votes(
         return votes + power @ closeness(jnp.rad2deg(yaw))
 
     power = jnp.minimum(num_points.astype(jnp.float32), VOTE_POINTS) * jnp.minimum(extent, VOTE_EXTENT_M)
-    ballots = yaw, jnp.where(voting, power, 0)
+    ballots = yaw, jnp.where(voting, power * score, 0)
     votes = jnp.zeros(num_angles, jnp.float32)
     votes = fold_rows(
         add, votes, ballots, num_rows=rows_in_use(voting), chunk=chunks.VOTES, absent=(0.0, 0.0)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from jaxbox.config import ClassPrior, DetectorConfig, RegionConfig, VehicleConfig
 from jaxbox.geometry.planar import rectangle_iou, wrap_yaw
+from jaxbox.stages._priors import asymmetric_gaussian, prior_of, size_score
 from jaxbox.stages.state import (
     NOT_A_BOX,
     Boxes,
@@ -20,7 +21,6 @@ from jaxbox.stages.state import (
     Kept,
     Obstacles,
     RayFractions,
-    prior_of,
 )
 from jaxbox.xla import chunks
 from jaxbox.xla.loops import map_rows
@@ -160,7 +160,7 @@ def _early_scores(
         num_points = take(clusters.num_points, cluster)
         by_evidence = evidence_score(num_points, hit, free_length, support, boxes.objective, config)
         prior = prior_of(config.classes, label)
-        by_size = size_score(jnp.stack([boxes.length, boxes.width], axis=1), prior)
+        by_size = size_score(boxes.length, boxes.width, prior)
         score = by_evidence * by_size * prior.prior_weight
         large_enough = jnp.max(boxes.measured, axis=1) >= config.min_extent_m
         return jnp.where((boxes.objective > NOT_A_BOX) & large_enough, score, 0)
@@ -387,23 +387,6 @@ def _top(highest: jax.Array, num_stray: jax.Array, levels: jax.Array, max_height
     return jnp.where(jnp.any(is_top, axis=1), jnp.minimum(share * max_height, highest), highest)
 
 
-def asymmetric_gaussian(
-    value: jax.Array, peak: jax.Array | float, below: jax.Array | float, above: jax.Array | float
-) -> jax.Array:
-    """exp(-((value - peak) / width)^2), with its own width on either side.
-
-    Args:
-      value: any shape.
-      peak: where it is 1.
-      below: width below the peak.
-      above: width above the peak.
-
-    Returns:
-      The same shape, in [0, 1].
-    """
-    return jnp.exp(-(((value - peak) / jnp.where(value < peak, below, above)) ** 2))
-
-
 def evidence_score(
     num_points: jax.Array,
     hit: jax.Array,
@@ -431,21 +414,6 @@ def evidence_score(
     grounded = jnp.minimum((support + 0.5) / config.support_points, 1)
     gate = jax.nn.sigmoid((objective - config.objective_gate) / config.objective_softness)
     return dense * jnp.exp(-((free_length / config.free_scale) ** 2)) * hit * grounded * gate
-
-
-def size_score(size: jax.Array, prior: ClassPrior) -> jax.Array:
-    """How well the box's length and width match the class.
-
-    Args:
-      size: (P, 2) float32, m: length, width.
-      prior: fields of (P,) float32.
-
-    Returns:
-      (P,) float32 in [0, 1].
-    """
-    length = asymmetric_gaussian(size[:, 0], prior.length_m, prior.length_below_m, prior.length_above_m)
-    tolerance_m = prior.width_tolerance_m
-    return length * asymmetric_gaussian(size[:, 1], prior.width_m, tolerance_m, tolerance_m)
 
 
 def neighbourhood_score(

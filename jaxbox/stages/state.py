@@ -5,13 +5,11 @@ C candidates, K detections. Rows beyond the number that counts hold finite numbe
 """
 
 import dataclasses
-from collections.abc import Sequence
 from typing import Protocol
 
 import jax
 import jax.numpy as jnp
 
-from jaxbox.config import ClassPrior
 from jaxbox.types import GroundPlane
 from jaxbox.xla.ragged import PointLists
 
@@ -338,28 +336,6 @@ class Owners:
     """(O,) int32: the best of the point's clusters' boxes that hold it, K for none."""
     num: jax.Array
     """() int32; only the first so many rows count."""
-
-
-def prior_of(classes: Sequence[ClassPrior], label: jax.Array) -> ClassPrior:
-    """The priors of labels: a `ClassPrior` of arrays.
-
-    Each number is chosen among the classes and not looked up, which would be a step of its own.
-
-    Args:
-      classes: in the order of the labels.
-      label: (P,) int32.
-
-    Returns:
-      Fields of (P,) float32.
-    """
-
-    def choose(*values: jax.Array | float) -> jax.Array:
-        chosen, *others = (jnp.asarray(value, jnp.float32) for value in values)
-        for i, other in enumerate(others, start=1):
-            chosen = jnp.where(label == i, other, chosen)
-        return jnp.broadcast_to(chosen, label.shape)
-
-    return jax.tree.map(choose, *classes)
 
 
 def longest_side(rectangles: Rectangles) -> jax.Array:
