@@ -361,7 +361,7 @@ def slow_criterion(xy, criterion, angle, min_distance):
 
 
 @pytest.mark.parametrize("criterion", ["variance", "closeness", "visible_closeness"])
-def test_criterion_curve_matches_a_loop_over_points_and_angles(criterion):
+def test_the_curve_of_every_criterion_matches_a_loop_over_points_and_angles(criterion):
     xy = np.add(turned(np.random.default_rng(5).uniform([-2, -1], [2, 1], (40, 2)), 0.4), [-9, 6])
     curve, _ = reference.try_rotations(xy, BoxConfig(criterion=criterion, num_angles=18))
     expected = [slow_criterion(xy, criterion, np.radians(5 * i), 0.05) for i in range(18)]
