@@ -347,11 +347,12 @@ def test_scene_direction_is_that_of_the_reference():
         count = rng.integers(0, 12)
         yaw, extent = rng.uniform(-4, 4, count), rng.uniform(0, 9, count)
         num_points, free = rng.integers(5, 400, count), rng.uniform(0, 0.3, count)
+        score = rng.uniform(0, 1, count) * rng.integers(0, 2, count)
         least, most = SETTINGS.direction_min_extent_m, SETTINGS.direction_max_free
         voting = (extent >= least) & (free <= most)
         np.testing.assert_array_equal(reference.may_vote(extent, free, SETTINGS), voting)
-        expected = reference.count_votes(yaw, extent, num_points, voting, SETTINGS)
-        rows = (parity.pad(value, 16) for value in (yaw, extent, num_points, voting))
+        expected = reference.count_votes(yaw, extent, num_points, score, voting, SETTINGS)
+        rows = (parity.pad(value, 16) for value in (yaw, extent, num_points, score, voting))
         preference = count_votes(*rows, SETTINGS)
         parity.assert_within(preference - expected, 1e-4, "preference")
 
@@ -362,7 +363,7 @@ def test_scene_direction_of_sweeps_is_that_of_the_reference(cases):
         yaw = np.array([done.box[4] for _, done in fits])
         extent = np.array([max(done.measured_length_m, done.measured_width_m) for _, done in fits])
         num_points = np.array([len(p.members) for p, _ in fits])
-        votes = yaw, extent, num_points, extent >= SETTINGS.direction_min_extent_m
+        votes = yaw, extent, num_points, np.ones(len(yaw)), extent >= SETTINGS.direction_min_extent_m
         expected = reference.count_votes(*votes, SETTINGS)
         preference = count_votes(*(parity.pad(value, parity.MAX_CLUSTERS) for value in votes), SETTINGS)
         assert np.argmax(expected) == np.argmax(np.asarray(preference))

@@ -631,15 +631,17 @@ def test_scene_direction_is_the_heavier_vote_modulo_a_quarter_turn():
         direction_sigma_deg=3.0, direction_min_extent_m=2.2, direction_max_free=0.15, direction_weight=0.2
     )
 
-    def vote(yaw_deg, extent, points, free):
-        voting = reference.may_vote(extent, free, config)
-        return reference.count_votes(np.radians(yaw_deg), extent, points, voting, config)
+    def vote(yaw_deg, extent, points, free, score=1.0):
+        voting, score = reference.may_vote(extent, free, config), np.full(len(extent), score)
+        return reference.count_votes(np.radians(yaw_deg), extent, points, score, voting, config)
 
     yaw_deg, extent, points = np.array([20, 110, -70, 50, 51, 52]), np.full(6, 4.0), np.full(6, 100)
     free = np.array([0, 0, 0, 0, 0.5, 0.5])
     assert np.argmax(vote(yaw_deg, extent, points, free)) == 20
     assert np.argmax(vote(yaw_deg, extent, points * [1, 0, 0, 9, 1, 1], free)) == 50
+    assert np.argmax(vote(yaw_deg, extent, points, free, score=[0.1, 0.1, 0.1, 0.9, 1, 1])) == 50
     assert not vote(yaw_deg, extent * 0.5, points, free).any()
+    assert not vote(yaw_deg, extent, points, free, score=0.0).any()
     gain = vote(np.array([89]), np.full(1, 4.0), np.full(1, 100), np.zeros(1))
     np.testing.assert_allclose(gain[[89, 0, 86]], 0.2 * np.exp([0, -1 / 9, -1]))
 
@@ -931,7 +933,6 @@ NO_TWIN = {
     "hull.trace_owned": "convex_hulls of lists of points",
     "rectangles.choose_rectangles": "best_rectangles in chunks",
     "state.longest_side": "a property of Rectangle",
-    "state.prior_of": "looks up classes by arrays of labels",
 }
 """Functions of the stages without a twin: what is about arrays of a fixed shape only."""
 

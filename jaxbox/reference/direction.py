@@ -7,6 +7,7 @@ import numpy as np
 from jaxbox.config import BoxConfig, DetectorConfig
 from jaxbox.reference.completion import assign_length_axis, extend_away
 from jaxbox.reference.evidence import cast_rays
+from jaxbox.reference.scoring import size_score
 from jaxbox.reference.state import Cluster, Evidence, Rectangle
 
 VOTE_POINTS, VOTE_EXTENT_M = 150, 6.0
@@ -29,19 +30,25 @@ def scene_preference(
     """
     prior = config.vehicles.classes[0]
 
-    def free_length(rectangle: Rectangle) -> float:
-        """The least of the boxes with either side as length; infinite where the class allows none."""
+    def look(rectangle: Rectangle) -> tuple[float, float]:
+        """The least free length of the boxes with either side as length, and the best score as a car.
+
+        Infinite and 0 where the class allows neither.
+        """
         both = (extend_away(assign_length_axis(rectangle, i), prior, config.completion) for i in (0, 1))
         boxes = np.array([box.box for box in both if box is not None]).reshape(-1, 5)
         rays = cast_rays(evidence, boxes, num_rays=config.completion.num_final_rays)
-        return rays.free_length.min(initial=np.inf)
+        by_size = np.array([size_score(box[2:4], prior) for box in boxes])
+        score = rays.hit * np.exp(-((rays.free_length / config.vehicles.free_scale) ** 2)) * by_size
+        return rays.free_length.min(initial=np.inf), score.max(initial=0)
 
     extent_m = np.array([rectangle.sides_m.max() for rectangle in rectangles])
-    free = np.array([free_length(rectangle) for rectangle in rectangles])
+    free, score = np.array([look(rectangle) for rectangle in rectangles]).reshape(-1, 2).T
     return count_votes(
         np.array([rectangle.angle for rectangle in rectangles]),
         extent_m,
         np.array([len(cluster.members) for cluster in clusters], int),
+        score,
         may_vote(extent_m, free, config.box),
         config.box,
     )
@@ -62,7 +69,12 @@ def may_vote(extent_m: np.ndarray, free_length: np.ndarray, config: BoxConfig) -
 
 
 def count_votes(
-    yaw: np.ndarray, extent_m: np.ndarray, num_points: np.ndarray, voting: np.ndarray, config: BoxConfig
+    yaw: np.ndarray,
+    extent_m: np.ndarray,
+    num_points: np.ndarray,
+    score: np.ndarray,
+    voting: np.ndarray,
+    config: BoxConfig,
 ) -> np.ndarray:
     """Prefers the direction modulo 90 degrees that most boxes share.
 
@@ -70,6 +82,7 @@ def count_votes(
       yaw: (k,) rad.
       extent_m: (k,) longer measured extent.
       num_points: (k,) points of the cluster.
+      score: (k,) in [0, 1], how much each looks like a car.
       voting: (k,) bool.
       config: A angles, i 90 / A degrees; a vote for d weighs exp(-(d / sigma)^2) at distance d, and so
         does the preference, times its height.
@@ -78,9 +91,10 @@ def count_votes(
       (A,) to be added to the curves; zero where no box votes.
     """
     num_angles, sigma_deg = config.num_angles, config.direction_sigma_deg
-    if not voting.any():
-        return np.zeros(num_angles)
     weight = np.minimum(num_points[voting], VOTE_POINTS) * np.minimum(extent_m[voting], VOTE_EXTENT_M)
+    weight = weight * score[voting]
+    if not weight.any():
+        return np.zeros(num_angles)
     angles = np.arange(num_angles) * 90 / num_angles
     distance = _turn_between_deg(angles[:, None], np.degrees(yaw[voting]))
     direction_deg = angles[np.argmax(np.exp(-((distance / sigma_deg) ** 2)) @ weight)]
