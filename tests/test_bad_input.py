@@ -3,9 +3,12 @@
 The inputs and the laws are in `quality.bad_input`, from which the documentation's table is made too.
 """
 
+import dataclasses
 import functools
 import json
+import re
 
+import chex
 import jax
 import numpy as np
 import pytest
@@ -36,9 +39,7 @@ def test_bad_input_has_a_lawful_answer_with_the_right_status(name, preset):
     assert Status(int(detections.status)) == case.status[preset]
     assert detections.score.max() <= case.best_score
     if case.same_as:
-        same, _ = jax.tree.flatten(answer(case.same_as, preset)[1])
-        for leaf, expected in zip(jax.tree.leaves(detections), same, strict=True):
-            np.testing.assert_array_equal(leaf, expected)
+        chex.assert_trees_all_equal(detections, answer(case.same_as, preset)[1])
 
 
 @pytest.mark.parametrize("preset", bad_input.PRESETS)
@@ -65,6 +66,41 @@ def test_bad_points_are_refused_saying_what_is_wrong_and_how_to_mend_it(name):
     arguments, options, message = bad_input.REFUSED[name]
     with pytest.raises(ValueError, match=message):
         PointCloud.from_numpy(*arguments, **options)
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "shape"),
+    [
+        ("xyz1", lambda xyz1: xyz1.T, "xyz1 (4, {0})"),
+        ("xyz1", lambda xyz1: xyz1[:, :3], "xyz1 ({0}, 3)"),
+        ("xyz1", lambda xyz1: xyz1[None], "xyz1 (1, {0}, 4)"),
+        ("xyz1", lambda xyz1: xyz1[:, 0], "xyz1 ({0},)"),
+        ("intensity", lambda intensity: intensity[1:], "intensity ({1},)"),
+        ("intensity", lambda intensity: intensity[:, None], "intensity ({0}, 1)"),
+        ("num_points", lambda num_points: num_points[None], "num_points (1,)"),
+    ],
+)
+def test_a_cloud_of_wrong_shapes_is_refused_saying_which_and_how_to_mend_it(name, spoil, shape):
+    cloud = bad_input.pad(bad_input.STREET)[1]
+    spoilt = dataclasses.replace(cloud, **{name: spoil(getattr(cloud, name))})
+    detect(cloud)  # The right shapes have a program.
+    with pytest.raises(ValueError, match="was given a cloud of shapes") as refused:
+        detect(spoilt)
+    message = str(refused.value)
+    assert shape.format(cloud.capacity, cloud.capacity - 1) in message
+    assert "must be xyz1 (N, 4), intensity (N,) and num_points ()" in message
+    assert "PointCloud.from_numpy" in message
+    assert "jax.vmap(jaxbox.detect)" in message
+
+
+def test_under_vmap_the_shapes_are_those_of_one_cloud():
+    cloud = bad_input.pad(bad_input.STREET)[1]
+    batch = jax.tree.map(lambda a: np.stack([a, a]), cloud)
+    found = jax.eval_shape(jax.vmap(detect), batch)
+    assert found.valid.shape[0] == 2
+    short = dataclasses.replace(batch, intensity=batch.intensity[:, 1:])
+    with pytest.raises(ValueError, match=re.escape(f"intensity ({cloud.capacity - 1},)")):
+        jax.eval_shape(jax.vmap(detect), short)
 
 
 def test_a_box_from_nothing_and_a_lost_point_are_noticed():

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -50,8 +51,7 @@ def rectangles(detections, least_score=0.0):
 
 
 def assert_same_bits(one, other):
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        np.testing.assert_array_equal(a, b)
+    chex.assert_trees_all_equal(jax.tree.leaves(one), jax.tree.leaves(other))
 
 
 def assert_well_formed(detections, xyz, capacity=CAPACITY):
@@ -62,28 +62,37 @@ def assert_well_formed(detections, xyz, capacity=CAPACITY):
 # One trace.
 
 
-def test_one_trace_serves_sweeps_of_any_length_and_any_thresholds_and_keys():
+def allow_traces(monkeypatch, num):
+    """Has the pipeline refuse to be traced once more often."""
+    chex.clear_trace_counter()
+    limited = chex.assert_max_traces(compiled.find_vehicles, n=num)
+    monkeypatch.setattr(compiled, "find_vehicles", limited)
+
+
+def test_one_trace_serves_sweeps_of_any_length_and_any_thresholds_and_keys(monkeypatch):
     xyz = street(0).xyz
     run(xyz)
-    size = compiled._detect_jit._cache_size()
+    allow_traces(monkeypatch, 0)
+    num_compiled = compiled.count_compilations()
     for length in (0, 1, 777, len(xyz), CAPACITY + 5):
         run(np.resize(xyz, (length, 3)))
     number_types = (lambda v: 1.1 * v, lambda v: int(v) + 1, np.float32, np.float64, np.asarray)
     for seed, convert in enumerate(number_types):
         run(xyz, config=jax.tree.map(convert, DetectorConfig()), key=jax.random.key(seed))
-    assert compiled._detect_jit._cache_size() == size
+    assert compiled.count_compilations() == num_compiled
+    with pytest.raises(AssertionError, match="traced > 0 times"):
+        run(xyz, capacity=CAPACITY + 1)
 
 
-def test_one_trace_serves_all_real_sweeps(data_root):
+def test_one_trace_serves_all_real_sweeps(data_root, monkeypatch):
     folders = ("kitti_object/training", "pandaset", "argoverse2", "kitti_tracking/training")
     sweeps = [sweep for folder in folders for sweep in open_sweeps(data_root / folder)]
-    size = compiled._detect_jit._cache_size()
+    allow_traces(monkeypatch, 1)
     lengths = set()
     for sweep in sweeps[:23] + sweeps[23::8]:
         xyz = sweep.read_points()[0]
         lengths.add(len(xyz))
         assert_well_formed(run(xyz, capacity=2**17), xyz, 2**17)
-    assert compiled._detect_jit._cache_size() <= size + 1
     assert len(lengths) > 20
 
 
@@ -170,8 +179,10 @@ def test_a_batch_of_clouds_alone_has_the_shapes_of_the_singles_and_an_axis_more(
 
 
 def assert_shapes_of_singles(batch, size):
-    for leaf, single in zip(jax.tree.leaves(batch), jax.tree.leaves(found(0)), strict=True):
-        assert (leaf.shape, leaf.dtype) == ((size, *single.shape), single.dtype)
+    def with_axis(single):
+        return jax.ShapeDtypeStruct((size, *single.shape), single.dtype)
+
+    chex.assert_trees_all_equal_shapes_and_dtypes(batch, jax.tree.map(with_axis, found(0)))
 
 
 def batch_anew(clouds):

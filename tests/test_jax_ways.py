@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import chex
 import jax
 import jax.experimental
 import jax.export
@@ -30,9 +31,8 @@ def paper(cloud):
 
 
 def assert_same_bits(one, other):
-    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
-        assert a.dtype == b.dtype
-        np.testing.assert_array_equal(a, b)
+    chex.assert_trees_all_equal_dtypes(one, other)
+    chex.assert_trees_all_equal(one, other)
 
 
 def row_of(batch, row):

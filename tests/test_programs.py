@@ -131,6 +131,16 @@ def test_what_it_has_no_program_for_is_left_to_detect(traced, tmp_path):
     assert kept.num_compiled == 0
 
 
+@pytest.mark.usefixtures("traced")
+def test_other_shapes_are_left_to_detect_also_where_there_is_a_program(tmp_path):
+    kept = KeptPrograms(tmp_path)
+    assert run(kept) is not None
+    for wrong in ({"xyz1": CLOUD.xyz1[:, :3]}, {"xyz1": CLOUD.xyz1.T}, {"intensity": CLOUD.intensity[1:]}):
+        assert run(kept, dataclasses.replace(CLOUD, **wrong)) is None
+    assert run(kept, jaxbox.stack_clouds([CLOUD, CLOUD])) is None
+    assert kept.num_compiled == 1
+
+
 def test_tracers_are_left_to_detect(traced, tmp_path):
     kept, asked = KeptPrograms(tmp_path), []
 

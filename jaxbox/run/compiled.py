@@ -5,6 +5,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, Protocol
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,7 +41,7 @@ def detect(
       The detections, best score first. Whatever was dropped is in `status` and `counts`.
 
     Raises:
-      ValueError: for fields that contradict each other.
+      ValueError: for fields that contradict each other, or arrays of other shapes than `PointCloud` says.
 
     Status bits: all of `Status`; `Detections.raise_if_failed` turns those of full capacities into an error.
 
@@ -178,18 +179,35 @@ def count_compilations() -> int:
     return num_jitted + (0 if _programs is None else _programs.num_compiled)
 
 
-def _in_32_bits(cloud: PointCloud) -> PointCloud:
-    """The cloud in its documented types, which with ``jax_enable_x64`` a caller's arrays may not have."""
-    return PointCloud(
+def _checked(cloud: PointCloud) -> PointCloud:
+    """The cloud in its documented types, which with ``jax_enable_x64`` a caller's arrays may not have.
+
+    Raises:
+      ValueError: where its arrays have other shapes than `PointCloud` says. That is looked at where a program
+        is traced, and so once for each shape.
+    """
+    cloud = PointCloud(
         xyz1=jnp.asarray(cloud.xyz1, jnp.float32),
         intensity=jnp.asarray(cloud.intensity, jnp.float32),
         num_points=jnp.asarray(cloud.num_points, jnp.int32),
     )
+    try:
+        chex.assert_shape(cloud.xyz1, (None, 4))
+        chex.assert_shape([cloud.intensity, cloud.num_points], [cloud.xyz1.shape[:1], ()])
+    except AssertionError as error:
+        names = (field.name for field in dataclasses.fields(cloud))
+        shapes = ", ".join(f"{name} {getattr(cloud, name).shape}" for name in names)
+        raise ValueError(
+            f"jaxbox.detect was given a cloud of shapes {shapes}; they must be xyz1 (N, 4), intensity (N,) "
+            "and num_points (). PointCloud.from_numpy makes a cloud of points (n, 3); a batch of clouds goes "
+            "through jax.vmap(jaxbox.detect)."
+        ) from error
+    return cloud
 
 
 def _find_vehicles(cloud: PointCloud, packed: PackedConfig, key: jax.Array) -> Detections:
     with building_for(accelerator=packed.accelerator):
-        return find_vehicles(_in_32_bits(cloud), packed.unpack(), key)
+        return find_vehicles(_checked(cloud), packed.unpack(), key)
 
 
 _one_after_the_other = jax.custom_batching.sequential_vmap(_find_vehicles)
@@ -229,7 +247,7 @@ def segment_packed(cloud: PointCloud, packed: PackedConfig, key: jax.Array) -> S
       What `decide_packed` reads.
     """
     with building_for(accelerator=packed.accelerator):
-        return detector.segment(_in_32_bits(cloud), packed.unpack(), key)
+        return detector.segment(_checked(cloud), packed.unpack(), key)
 
 
 @jax.jit
@@ -245,7 +263,7 @@ def decide_packed(cloud: PointCloud, segments: Segments, packed: PackedConfig) -
       The detections, as `detect` gives them.
     """
     with building_for(accelerator=packed.accelerator):
-        return detector.decide(_in_32_bits(cloud), segments, packed.unpack())
+        return detector.decide(_checked(cloud), segments, packed.unpack())
 
 
 @_find.def_vmap

@@ -130,6 +130,9 @@ class KeptPrograms:
         device = _common_device(operands)
         if device is None or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
             return None
+        num_rows = cloud.intensity.size
+        if [operand.shape for operand in operands[:3]] != [(num_rows, 4), (num_rows,), ()]:
+            return None
         key_of_build = settings.structure, cloud.capacity, settings.accelerator, device, _options()
         compiled = self._compiled.get(key_of_build)
         if compiled is None:

@@ -3,6 +3,7 @@
 import functools
 from typing import NamedTuple
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -36,6 +37,7 @@ def assign_points(kept: Kept, obstacles: Obstacles, clusters: Clusters) -> Owner
     Returns:
       The points that may belong to one, and to which.
     """
+    chex.assert_shape([obstacles.xy, clusters.of_point], [(None, 2), (None, *obstacles.height.shape)])
     num_detections, num_clusters = kept.valid.shape[0], clusters.num_points.shape[0]
     rank = jnp.where(kept.valid, jnp.arange(num_detections, dtype=jnp.int32), num_detections)
     of_cluster = jnp.full(num_clusters + 1, num_detections, jnp.int32).at[kept.cluster].min(rank, mode="drop")

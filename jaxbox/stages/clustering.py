@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -28,6 +29,7 @@ def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Clusters:
       The clusters, map after map, and which of them each point belongs to.
     """
     maps, num = config.clustering.maps, obstacles.height.shape[0]
+    chex.assert_shape([obstacles.row, obstacles.height, obstacles.xy], [(num,), (num,), (num, 2)])
     grids = arrange_grids(config.clustering, config.region)
     cell, flags = _find_cells(obstacles, grids, config)
     components = label_components(flags, grids, max_runs=sum(m.max_cells for m in maps))

@@ -5,6 +5,7 @@ import functools
 from collections.abc import Sequence
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -80,6 +81,7 @@ def complete_boxes(
     Returns:
       The hypotheses and their boxes.
     """
+    chex.assert_shape([each.rows for each in candidates], (*clusters.num_points.shape, 6))
     hypotheses = list_hypotheses(clusters, candidates, config.vehicles)
     if config.completion.mode == "evidence":
         assert cast_rays is not None  # see check_config

@@ -1,5 +1,6 @@
 """Shape descriptors: moment of inertia, eccentricity, density, complexity (paper, 3.5 and 4.4)."""
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -28,6 +29,7 @@ def describe(
       num_points: (K,) int32.
       descriptors: of K detections.
     """
+    chex.assert_shape([xy, owners.row, owners.owner], [(None, 2), xy.shape[:1], xy.shape[:1]])
     moments = point_moments(owners.owner, owners.row, owners.num, xy, kept.center[:, :2])
     shape, every = (moments, hull_area, hulls.num_vertices), jnp.int32(kept.valid.shape[0])
     shapes = map_rows(lambda rows: shape_descriptors(*rows), shape, num_rows=every)

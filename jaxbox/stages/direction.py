@@ -2,6 +2,7 @@
 
 import functools
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -31,6 +32,7 @@ def scene_preference(
     Returns:
       (A,) float32, to be added to the curves; zero where no rectangle votes.
     """
+    chex.assert_shape(rectangles.rows, (*clusters.num_points.shape, 6))
     size = config.clustering.maps[0].max_clusters
     rectangles = Rectangles(rectangles.rows[:size])
     long = longest_side(rectangles) >= config.box.direction_min_extent_m

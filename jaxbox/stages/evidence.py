@@ -3,6 +3,7 @@
 import functools
 import math
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -64,6 +65,7 @@ def observe(sweep: Sweep, ground: Ground, config: EvidenceConfig) -> Evidence | 
     """
     if not config.enabled:
         return None
+    chex.assert_shape([sweep.inlier, ground.height], sweep.xyz.shape[:1])
     sensor_height_m = -ground.plane.coefficients[2]
     return build_evidence(sweep.xyz, ground.height, sweep.inlier, sensor_height_m, config)
 

@@ -1,5 +1,6 @@
 """Statistical filtering by mean shift and standard deviation (paper, section 3.1)."""
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -31,6 +32,7 @@ def select_points(cloud: PointCloud, config: FilterConfig, region: RegionConfig)
     Returns:
       The points, and what each of them is.
     """
+    chex.assert_shape([cloud.xyz1, cloud.num_points], [(None, 4), ()])
     xyz1, is_point, finite, in_region = materialize(_in_region(jnp.asarray(cloud.xyz1), region))
     inlier = filter_outliers(xyz1, config, region) if config.enabled else in_region
     return Sweep(xyz1, jnp.asarray(cloud.num_points), is_point, finite, in_region, inlier)

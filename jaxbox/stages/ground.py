@@ -3,6 +3,7 @@
 import functools
 import math
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,6 +56,7 @@ def remove_ground(sweep: Sweep, config: GroundConfig, key: jax.Array) -> Ground:
     Returns:
       The ground and the heights.
     """
+    chex.assert_shape([sweep.xyz1, sweep.inlier], [(None, 4), sweep.xyz1.shape[:1]])
     if config.candidates == "cell_minima":
         candidates, valid = cell_minima(sweep.xyz, sweep.inlier, config)
     else:
@@ -78,6 +80,7 @@ def gather_obstacles(sweep: Sweep, ground: Ground, config: DetectorConfig) -> Ob
     Returns:
       The points, in the sweep's order; those beyond the capacity are left out, and counted.
     """
+    chex.assert_shape([sweep.inlier, ground.height], sweep.xyz.shape[:1])
     low_m, high_m = config.ground.min_height_m, config.ground.max_height_m
     between = (ground.height > low_m) & (ground.height < high_m)
     row, count = compact(sweep.inlier & between, obstacle_capacity(config, sweep.xyz.shape[0]))

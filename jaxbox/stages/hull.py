@@ -1,5 +1,6 @@
 """Convex hulls of many clusters at a fixed shape (paper, section 3.3)."""
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -30,6 +31,8 @@ def outline_clusters(obstacles: Obstacles, clusters: Clusters, config: DetectorC
     Returns:
       Lists of points.
     """
+    of_point = len(config.clustering.maps), obstacles.height.shape[0]
+    chex.assert_shape([clusters.of_point, clusters.fitted], of_point)
     if config.box.fit_to == "hull":
         return _hull_points(obstacles, clusters, config.hull)
     return _slab_points(obstacles, clusters, config)
@@ -114,6 +117,7 @@ def trace_owned(owners: Owners, xy: jax.Array, kept: Kept, config: HullConfig) -
       hulls: of K detections.
       area: (K,) float32, m^2.
     """
+    chex.assert_shape([xy, owners.row, owners.owner], [(None, 2), xy.shape[:1], xy.shape[:1]])
     rows = owners.owner, owners.row, owners.num, xy
     bounds = find_bounds(*rows, num_clusters=kept.valid.shape[0])
     index = extreme_points(*rows, *bounds, num_slices=config.num_slices)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,6 +36,7 @@ def fit_rectangles(outlines: Outlines, num_clusters: jax.Array, config: BoxConfi
       The rectangles, of the clusters with most points first.
     """
     points = outlines.points
+    chex.assert_equal_shape([points.start, points.total])
     order, place = largest_first(points.count, points.max_points)
     curve, extents = try_rotations(points, order, num_clusters, config)
     return Rotations(curve, extents, place)
@@ -58,6 +60,8 @@ def choose_rectangles(
     def best(rotations: tuple[jax.Array, jax.Array]) -> jax.Array:
         return best_rectangles(*rotations, preference, gain=gain).rows.T
 
+    num_angles, num_columns = rotations.curve.shape
+    chex.assert_shape([preference, rotations.extents], [(num_angles,), (4, num_angles, num_columns)])
     columns = rotations.curve, rotations.extents
     rows = map_rows(best, columns, num_rows=num_clusters, chunk=chunks.PROPOSALS, axis=-1)
     return Rectangles(rows.T[rotations.place])

@@ -5,6 +5,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 
@@ -119,6 +120,7 @@ def score_boxes(
       The boxes with a score, best first.
     """
     hypotheses, boxes, settings = completed.hypotheses, completed.boxes, config.vehicles
+    chex.assert_shape([boxes.center, boxes.yaw], [(*hypotheses.label.shape, 2), hypotheses.label.shape])
     score = _early_scores(completed, rays, clusters, settings)
     chosen, num = select_highest(score, settings.max_candidates, settings.min_score)
 
@@ -220,6 +222,7 @@ def keep_best(candidates: Candidates, config: VehicleConfig) -> Kept:
     Returns:
       K rows; the lowest-scoring beyond the capacity are left out, and counted.
     """
+    chex.assert_shape(candidates.rectangle, (*candidates.valid.shape, 5))
     keep = non_max_suppression(candidates.rectangle, candidates.valid, max_overlap=config.max_overlap)
     row, num = compact(keep, config.max_detections)
 
