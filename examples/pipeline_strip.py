@@ -7,7 +7,6 @@ The sweep is synthetic, so that the picture can be published under the project's
 """
 
 import argparse
-import dataclasses
 from collections.abc import Sequence
 
 import cv2
@@ -104,17 +103,15 @@ def extents_along(hull: np.ndarray, yaw: float) -> np.ndarray:
 
 def free_space(xyz: np.ndarray, height: np.ndarray, detections: Detections) -> np.ndarray:
     """(h, w) bool: the pixels of `FRAME` through which some beam passed at the height of a car."""
-    settings = DetectorConfig().evidence
-    options = {field.name: getattr(settings, field.name) for field in dataclasses.fields(settings)}
-    del options["enabled"]
+    config = DetectorConfig().evidence
     sensor_height_m = -float(detections.ground.coefficients[2])
-    evidence = reference.build_evidence(xyz, height, sensor_height_m=sensor_height_m, **options)
+    evidence = reference.build_evidence(xyz, height, sensor_height_m, config)
     is_free = np.diff(evidence.free_sums, axis=1) > 0
     rows, columns = np.indices(FRAME.shape) + 0.5
     x = FRAME.x_range_m[0] + columns / FRAME.px_per_m
     y = FRAME.y_range_m[1] - rows / FRAME.px_per_m
-    azimuth = reference.azimuth_cell(np.arctan2(y, x), settings.num_azimuths)
-    return is_free[azimuth, (np.hypot(x, y) / settings.range_cell_m).astype(int)]
+    azimuth = reference.azimuth_cell(np.arctan2(y, x), config.num_azimuths)
+    return is_free[azimuth, (np.hypot(x, y) / config.range_cell_m).astype(int)]
 
 
 def true_outlines(sweep: synthetic.SyntheticSweep) -> list[np.ndarray]:

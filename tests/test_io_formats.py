@@ -218,7 +218,7 @@ BAD = {
     "text.npy": ("no array", r"no readable \.npy array"),
     "text.npz": ("no archive", r"no readable \.npz file"),
     "text.feather": ("no table", "no readable Feather table"),
-    "text.pcd.bin": ("x" * 16, "no multiple of 20"),
+    "text.pcd.bin": ("x" * 16, "not a multiple of 20"),
     "text.bag": ("no bag", "the bag cannot be read"),
     "text.db3": ("no bag", "the bag cannot be read"),
     "text.mcap": ("no recording", "the MCAP file cannot be read"),

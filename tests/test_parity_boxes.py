@@ -421,9 +421,10 @@ def test_a_hull_beyond_its_capacity_is_fitted_to_by_its_own_vertices():
     disc = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     away = np.array([10, 0])
     xy = jnp.float32(np.concatenate([disc + away, disc - away]))
-    obstacles = types.SimpleNamespace(xy=xy, count=jnp.int32(len(xy)))
+    obstacles = types.SimpleNamespace(xy=xy, height=jnp.ones(len(xy)), count=jnp.int32(len(xy)))
     clusters = types.SimpleNamespace(
         of_point=jnp.repeat(jnp.arange(2), 40)[None],
+        fitted=jnp.ones((1, 80), bool),
         num_points=jnp.array([40, 40]),
         num=jnp.int32(2),
         low=jnp.array([[9.0, -1], [-11, -1]]),
