@@ -187,7 +187,7 @@ class Descriptors:
 
 
 NUM_POINT_COUNTS = 9
-"""The first so many fields of `Counts` share out every point of the sweep."""
+"""The first fields of `Counts` share out every point of the sweep."""
 
 
 @jax.tree_util.register_dataclass

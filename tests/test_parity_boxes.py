@@ -382,7 +382,7 @@ def test_descriptors_are_those_of_the_reference(cases):
             jnp.arange(parity.MAX_OBSTACLES),
             len(xy),
             parity.pad(xy, parity.MAX_OBSTACLES),
-            # Up to a metre beside the middle, as that of a completed box may be.
+            # Up to a metre next to the middle, as that of a completed box may be.
             parity.pad(np.array([m.mean(axis=0) + 0.7 for m in members]), parity.MAX_CLUSTERS),
         )
         ours = shape_descriptors(
@@ -404,7 +404,7 @@ def test_descriptors_are_those_of_the_reference(cases):
 
 
 def test_descriptors_of_a_rectangle_a_point_and_none_are_those_worked_by_hand():
-    # Sums of 1, x, y, x^2, y^2 and x y of the corners (+-2, +-1), of one point, then of nothing, beside what
+    # Sums of 1, x, y, x^2, y^2 and x y of the corners (+-2, +-1), of one point, then of nothing, next to what
     # an earlier cluster of that row left behind.
     moments = jnp.array([[4.0, 0, 0, 16, 4, 0], [1.0, 3, 0, 9, 0, 0], [0.0, 0, 0, 0, 0, 0]])
     found = shape_descriptors(moments, jnp.array([8.0, 0.0, 8.0]), jnp.array([4, 1, 4]))

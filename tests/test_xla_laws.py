@@ -1,4 +1,4 @@
-"""Every public function of `jaxbox.xla` states its law in one line, and a test beside this one runs it."""
+"""Every public function of `jaxbox.xla` states its law in one line, and a test next to this one runs it."""
 
 import ast
 import importlib

@@ -9,7 +9,7 @@ from jaxbox.reference.state import Evidence, Ground, RayFractions, Sweep
 SUPPORT_HALF_M = 100
 """The ground support grid covers |x|, |y| below this in cells of 1 m."""
 SUPPORT_WINDOW = 7
-"""Ground points are counted over so many cells in x and y round a box's centre."""
+"""Ground points are counted over that many cells in x and y round a box's centre."""
 MIN_DESCENT_M = 1e-3
 """A beam that falls less than this before its return is level and shows nothing below it."""
 FULL_BEAM = 1 - 1e-6

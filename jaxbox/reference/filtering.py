@@ -11,7 +11,7 @@ MAX_ABS_Z_M = 100.0
 
 
 def select_points(xyz: np.ndarray, config: FilterConfig, region: RegionConfig) -> Sweep:
-    """Picks the finite points in the region, and those of them that are no outliers.
+    """Picks the finite points in the region, and those of them that are not outliers.
 
     Args:
       xyz: (n, 3) m, sensor frame; NaN and infinity allowed.

@@ -17,7 +17,7 @@ WIDE_WEIGHT = 0.015
 NARROW_WEIGHT = 0.02
 """Weight of the wide Gaussian in the narrow one."""
 POOL_CELLS = 2
-"""The grid is smoothed on squares of so many cells, and is theirs."""
+"""The grid is smoothed on squares of that many cells, and is theirs."""
 WIDE_POOL_CELLS = 8
 """So many for the wide Gaussian."""
 TRUNCATE = 3.0

@@ -163,7 +163,7 @@ def cluster_alone(num_points: int, top: float) -> NeighbourhoodCounts:
 
 
 def top_of(height: np.ndarray, max_height_m: float, top_quantile: float) -> float:
-    """The height that a share of the points of a vehicle exceed, so that a stray return is no roof.
+    """The height that a share of the points of a vehicle exceed, so that a stray return is not a roof.
 
     Args:
       height: (n,) m above the ground, below the next.

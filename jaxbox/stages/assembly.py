@@ -145,7 +145,7 @@ def _claim_points(nowhere: jax.Array, owners: Owners, obstacles: Obstacles, num_
 
 
 def _count_points(found: Found, config: DetectorConfig) -> jax.Array:
-    """Points that are no padding, finite, in the region, no outliers, ground, overhead, and of a cluster."""
+    """Points that are not padding, finite, in the region, no outliers, ground, overhead, and of a cluster."""
     sweep, height, clusters = found.sweep, found.ground.height, found.clusters
     above = height > config.ground.min_height_m
     overhead = above & (height >= config.ground.max_height_m)

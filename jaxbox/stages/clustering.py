@@ -204,7 +204,7 @@ def find_statistics(
 
     Args:
       component: (maps, N) int32 of each point on each map.
-      num_points: () int32; only the first so many points count.
+      num_points: () int32; how many points count, from the first on.
       xy: (N, 2) float32, m.
       height: (N,) float32, m, above the ground.
       in_slab: (N,) bool.
@@ -231,7 +231,7 @@ class ChosenComponents:
     """The components that pass the size gates, in one list of P rows: map by map, without gaps."""
 
     row: jax.Array
-    """(C,) int32: row of each component, or P where it is no cluster."""
+    """(C,) int32: row of each component, or P where it is not a cluster."""
     num_points: jax.Array
     """(P,) int32: points of each cluster; 0 for an empty row."""
     num_slab: jax.Array

@@ -44,7 +44,7 @@ def point_moments(
     Args:
       slot: (L,) int32 cluster of each point of a list, K for none.
       row: (L,) int32 rows of those points.
-      num_rows: () int32; only the first so many of the list count.
+      num_rows: () int32; how many of the list count, from the first on.
       xy: (N, 2) float32, m.
       origin: (K, 2) float32, m, a point near each cluster: moments about it do not cancel.
 

@@ -22,7 +22,7 @@ MIN_DENSITY = 1e-6
 
 
 def select_points(cloud: PointCloud, config: FilterConfig, region: RegionConfig) -> Sweep:
-    """Picks the finite points in the region, and those of them that are no outliers.
+    """Picks the finite points in the region, and those of them that are not outliers.
 
     Args:
       cloud: of N rows.
@@ -39,7 +39,7 @@ def select_points(cloud: PointCloud, config: FilterConfig, region: RegionConfig)
 
 
 def _in_region(xyz1: jax.Array, region: RegionConfig) -> tuple[jax.Array, ...]:
-    """The points within the region, and which are no padding, are finite, are within."""
+    """The points within the region, and which are not padding, are finite, are within."""
     is_point = xyz1[:, 3] > 0
     finite = valid = is_point
     for axis, limit in enumerate((region.half_x_m, region.half_y_m, MAX_ABS_Z_M)):

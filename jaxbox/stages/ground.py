@@ -34,15 +34,15 @@ FAR_FILL_PRIOR = 0.015
 
 
 POOL_CELLS = 2
-"""The ground is smoothed on squares of so many cells: twice a cell is still no wider than the Gaussian."""
+"""The ground is smoothed on squares of that many cells: twice a cell is still no wider than the Gaussian."""
 
 
 WIDE_POOL_CELLS = 8
-"""The wide Gaussian works on squares of so many cells."""
+"""The wide Gaussian works on squares of that many cells."""
 
 
 GAUSSIAN_TRUNCATION = 3.0
-"""Gaussians reach so many standard deviations, as in scipy.ndimage.gaussian_filter(truncate=3)."""
+"""Gaussians reach that many standard deviations, as in scipy.ndimage.gaussian_filter(truncate=3)."""
 
 
 def remove_ground(sweep: Sweep, config: GroundConfig, key: jax.Array) -> Ground:
@@ -145,7 +145,7 @@ def spread_points(
     Args:
       xyz: (N, 3) float32, m, sensor frame.
       mask: (N,) bool, points that count.
-      num_points: () int32, rows that are no padding.
+      num_points: () int32, rows that are not padding.
       config: `num_candidates` is C.
 
     Returns:
@@ -315,7 +315,7 @@ def _lower_envelope(lowest: jax.Array, step_m: jax.Array | float, num_rounds: in
 
 
 def _jumps(num_rounds: int) -> list[int]:
-    """Jumps straight or across that lead wherever so many single steps do, at the same cost.
+    """Jumps straight or across that lead wherever as many single steps do, at the same cost.
 
     >>> _jumps(10)
     [1, 1, 2, 2, 4]

@@ -72,7 +72,7 @@ def _list_rows(
     Returns:
       cluster: (capacity,) int32.
       row: (capacity,) int32 of the obstacle.
-      num: () int32; only the first so many count.
+      num: () int32; how many rows count, from the first on.
     """
     num_maps, num_obstacles = clusters.of_point.shape
     entry, num = compact(listed, capacity, num=obstacles.count)
@@ -134,7 +134,7 @@ def find_bounds(
     Args:
       slot: (L,) int32 cluster of each point of a list, `num_clusters` for none.
       row: (L,) int32 rows of those points.
-      num_rows: () int32; only the first so many of the list count.
+      num_rows: () int32; how many of the list count, from the first on.
       xy: (N, 2) float32, m.
       num_clusters: static, K.
 
@@ -175,7 +175,7 @@ def extreme_points(
     Args:
       slot: (L,) int32 cluster of each point of a list, K for none.
       row: (L,) int32 rows of those points.
-      num_rows: () int32; only the first so many of the list count.
+      num_rows: () int32; how many of the list count, from the first on.
       xy: (N, 2) float32, m.
       low: (K, 2) float32, m, least x and y of each cluster.
       high: (K, 2) float32, m, greatest x and y.
@@ -232,7 +232,7 @@ def convex_hulls(
 
     Returns:
       x: (H, C) float32, m, of the vertices, padded by repeating the last; where there are more than H,
-        every so many are kept, evenly round the hull; zeros where no point is valid.
+        every n-th is kept, evenly round the hull; zeros where no point is valid.
       y: (H, C) float32, m, likewise.
       num_vertices: (C,) int32, the true number, which may exceed H.
 

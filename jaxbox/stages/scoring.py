@@ -51,8 +51,8 @@ LOWEST_LEVEL = 0.4
 
 
 PSEUDO_COUNT = 5
-"""Pseudo-count: so many upper points, with the share of the full score behind the faces, are added, as of few
-points the share says little."""
+"""Pseudo-count: upper points that are added, with the share of the full score behind the faces: of few points
+the share says little."""
 
 
 INSIDE_TOLERANCE_M = 1e-3
@@ -380,7 +380,7 @@ def _judge(
 
 
 def _top(highest: jax.Array, num_stray: jax.Array, levels: jax.Array, max_height: jax.Array) -> jax.Array:
-    """(P,) the height that so many points exceed, evenly spread within their level (P, levels)."""
+    """(P,) the height that that many points exceed, evenly spread within their level (P, levels)."""
     higher = sum_after(levels)
     num_stray = num_stray[:, None]
     is_top = (higher <= num_stray) & (num_stray < higher + levels)
@@ -406,7 +406,7 @@ def evidence_score(
       free_length: (P,) float32, fraction of the rays' length.
       support: (P,) float32, ground points round the box.
       objective: (P,) float32, J of the box.
-      config: (points / saturation)^power, exp(-(free_length / scale)^2), full score from so many ground
+      config: (points / saturation)^power, exp(-(free_length / scale)^2), full score from that many ground
         points, and 1 / (1 + exp(-(J - gate) / softness)).
 
     Returns:

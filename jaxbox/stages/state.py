@@ -335,7 +335,7 @@ class Owners:
     owner: jax.Array
     """(O,) int32: the best of the point's clusters' boxes that hold it, K for none."""
     num: jax.Array
-    """() int32; only the first so many rows count."""
+    """() int32; how many rows count, from the first on."""
 
 
 def longest_side(rectangles: Rectangles) -> jax.Array:

@@ -41,7 +41,7 @@ def outline(function: Callable[..., Any], *operands: Any) -> Any:
     Law: ``function(*operands)``.
 
     XLA makes constants, such as the zeros that a scatter starts from, as early as it can: those of a long
-    program would all be there from its start, beside the scratch of whatever comes first. What is inside a
+    program would all be there from its start, next to the scratch of whatever comes first. What is inside a
     conditional is made when it is needed, and stored. On an accelerator the function is simply called.
 
     Args:

@@ -2,8 +2,8 @@
 
 None of them changes a result. A chunk is large enough for wide vectors and few turns of a loop, and small
 enough for its scratch memory to stay in the cache; with one row at a time XLA compiles a loop to native code.
-Each was chosen by ``python -m benchmarks.bench_stages``, on real sweeps, beside half and twice its size; what
-came of it is in docs/notes/kernels_on_cpu.md, unless another place is named.
+They were chosen by timing real sweeps (``python -m benchmarks.bench_stages``); what came of it is in
+docs/notes/kernels_on_cpu.md, unless another place is named.
 """
 
 FILTER_BLOCKS = 1024

@@ -267,7 +267,7 @@ class _Runs:
     def look(
         self, row: CellGrids, side: int, cell: jax.Array, node: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """Whether each node touches a run at the cell beside its line (before, 0, or after, 1), and which."""
+        """Whether each node touches a run at a cell of a line next to it (before: 0, after: 1), and which."""
         place = _place(cell, row.num_strips)
         other = _run_at(self.starts, self.before, place)
         exist = (node > NONE) & (node < self.num) & (other < self.num)

@@ -100,7 +100,7 @@ def map_rows(
 
 
 def _whole_chunks(rows: Any, chunk: int, axis: int = 0) -> Any:
-    """Rows with zeros after the last, so that they are so many whole chunks."""
+    """Rows with zeros after the last, so that they are whole chunks."""
     missing = -jax.tree.leaves(rows)[0].shape[axis] % chunk
 
     def extended(a: jax.Array) -> jax.Array:

@@ -30,7 +30,7 @@ def flag_cells(
         (chunk,) int32 a map.
       prepare: what is the same for all maps, of a chunk of the columns.
       columns: pytree of (N, ...) arrays.
-      num_rows: () int32; only the first so many points count, which may be more than N.
+      num_rows: () int32; how many points count, from the first on, which may be more than N.
       cells: static, those of all maps.
 
     Returns:
@@ -69,7 +69,7 @@ def map_tables(
     Args:
       function: maps a chunk (chunk,) of a row of the table, and what is prepared, to a pytree of such chunks.
       table: (maps, M), with M as `flag_cells` gives it.
-      num_rows: () int32; points beyond the first so many may keep what `init` says.
+      num_rows: () int32; points beyond this many may keep what `init` says.
       init: pytree of (maps, M) arrays.
       prepare: what is the same for all maps, of a chunk of the columns; None for nothing.
       columns: pytree of (N, ...) arrays that `prepare` reads.

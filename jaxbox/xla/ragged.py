@@ -32,7 +32,7 @@ class PointLists:
     total: jax.Array
     """(K,) int32, how many they are."""
     max_points: int = dataclasses.field(metadata={"static": True})
-    """static, M: so many of a cluster are looked at."""
+    """static, M: that many of a cluster are looked at."""
 
     @property
     def count(self) -> jax.Array:
@@ -81,7 +81,7 @@ def list_points(
     Args:
       cluster: (E,) int32, in [0, num_clusters).
       row: (E,) int32, of the point in `xy`.
-      num_entries: () int32; only the first so many entries count.
+      num_entries: () int32; how many entries count, from the first on.
       xy: (N, 2) float32, m.
       num_clusters: static, K.
       max_points: static, M.

@@ -152,7 +152,7 @@ def compact(mask: jax.Array, capacity: int, *, num: jax.Array | None = None) -> 
     Args:
       mask: (N,) bool, or (M, N), whose rows are gone through one after the other.
       capacity: static; entries beyond it are left out.
-      num: () int32: no entry of a row is True beyond the first so many, of which there may be more than N.
+      num: () int32: no entry of a row is True beyond this many, which may be more than N.
         A CPU does not look at them.
 
     Returns:
@@ -228,7 +228,7 @@ def lookup(table: jax.Array, *index: jax.Array) -> jax.Array:
     """Entries of a table at indices that are known to lie inside. Law: ``table[index]``.
 
     One flat index: several would first be joined to rows, which costs more than the look-up (XLA, CPU). A
-    single entry is looked up as it is, since a loop that has another view of a table is no native one.
+    single entry is looked up as it is, since a loop that has another view of a table is not a native one.
 
     Args:
       table: (A, B, ...), as many axes as there are indices.
@@ -396,7 +396,7 @@ def map_selected(
     Returns:
       index: (P,) int32 of the selected rows, P beyond.
       values: (P, ...) of those rows.
-      num: () int32; only the first so many of both count.
+      num: () int32; how many of both count, from the first on.
     """
     size = jax.tree.leaves(rows)[0].shape[0]
     if on_accelerator():

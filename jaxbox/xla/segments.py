@@ -30,7 +30,7 @@ def reduce_segments(
       describe: gives the numbers of rows whose maxima are sought, and those whose sums are.
       rows: pytree of (N, ...) arrays.
       segment: (maps, N) int32, of each row on each map, in [0, S).
-      num_rows: () int32; only the first so many rows count.
+      num_rows: () int32; how many rows count, from the first on.
       num_segments: static, S.
 
     Returns:

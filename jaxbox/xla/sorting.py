@@ -42,7 +42,7 @@ def sort_by_group(
     Args:
       read: gives the values of rows, a pytree of arrays, by their indices.
       group: (N,) int32, in [0, num_groups).
-      num_rows: () int32; only the first so many rows count.
+      num_rows: () int32; how many rows count, from the first on.
       num_groups: static, K.
       room: static, rows added at the end.
 
@@ -148,7 +148,7 @@ def best_first(score: jax.Array, num: jax.Array) -> jax.Array:
 
     Args:
       score: (P,) float32, no NaN.
-      num: () int32; rows beyond the first so many score nothing.
+      num: () int32; rows beyond this many score nothing.
 
     Returns:
       (P,) int32 rows, P beyond the last.
