@@ -96,11 +96,10 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
 @jax.jit
 def score_boxes(columns, prior):
     around = scoring.NeighbourhoodCounts(jnp.stack(columns["around"], axis=1))
-    size = jnp.stack([columns["length"], columns["width"]], axis=1)
     seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "objective"))
     early = scoring.evidence_score(*seen, SETTINGS)
     late = scoring.neighbourhood_score(around, columns["rho"], prior, SETTINGS)
-    return early * scoring.size_score(size, prior) * late * prior.prior_weight
+    return early * scoring.size_score(columns["length"], columns["width"], prior) * late * prior.prior_weight
 
 
 def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
