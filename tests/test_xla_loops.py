@@ -154,6 +154,23 @@ def test_map_rows_maps_along_the_last_axis_too(platform):
     np.testing.assert_array_equal(mapped, jnp.where(done, 2 * values, 0))
 
 
+@pytest.mark.parametrize("size", [0, 1, 4, 7, 8])
+@pytest.mark.parametrize("axis", [0, -1])
+def test_whole_chunks_puts_zeros_after_the_last_row(size, axis):
+    along = np.arange(1, size + 1)
+    table = along[:, None] * [1.0, 2.0, 3.0] if axis == 0 else np.array([[1.0], [2.0], [3.0]]) * along
+    rows = {"line": along.astype(np.int32), "table": table.astype(np.float32)}
+    whole = jax.jit(lambda rows: loops.whole_chunks(rows, 4, axis))(rows)
+    width = (0, -size % 4)
+    chex.assert_trees_all_equal(
+        whole,
+        {
+            "line": np.pad(rows["line"], [width]),
+            "table": np.pad(rows["table"], [width, (0, 0)] if axis == 0 else [(0, 0), width]),
+        },
+    )
+
+
 @pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("size", [1, 3, 8, 9])
 def test_map_batches_is_vmap(size):

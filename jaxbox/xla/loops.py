@@ -77,7 +77,7 @@ def map_rows(
         return function(rows)
     function = jax.jit(function, inline=True)  # Traced once, for its shapes and for the loop.
     capacity = jax.tree.leaves(rows)[0].shape[axis]
-    whole = _whole_chunks(rows, chunk, axis)
+    whole = whole_chunks(rows, chunk, axis)
     room = jax.tree.leaves(whole)[0].shape[axis]
 
     def part(start: jax.Array) -> Any:
@@ -99,8 +99,19 @@ def map_rows(
     return jax.tree.map(lambda a: jax.lax.slice_in_dim(a, 0, capacity, axis=axis), out)
 
 
-def _whole_chunks(rows: Any, chunk: int, axis: int = 0) -> Any:
-    """Rows with zeros after the last, so that they are whole chunks."""
+def whole_chunks(rows: Any, chunk: int, axis: int = 0) -> Any:
+    """Puts zeros after the last row, so that the rows are whole chunks.
+
+    Law: ``np.pad(rows, (0, -P % chunk))``, along the axis.
+
+    Args:
+      rows: pytree of arrays with P rows along the axis.
+      chunk: static, rows at a time.
+      axis: static, that of all arrays along which the rows lie.
+
+    Returns:
+      Pytree of arrays with P or up to ``chunk - 1`` more rows.
+    """
     missing = -jax.tree.leaves(rows)[0].shape[axis] % chunk
 
     def extended(a: jax.Array) -> jax.Array:
@@ -148,7 +159,7 @@ def fold_rows(
 
     if on_accelerator():
         return fold(state, jnp.arange(size, dtype=jnp.int32), rows)
-    whole = _whole_chunks(rows, chunk)
+    whole = whole_chunks(rows, chunk)
 
     def step(start: jax.Array, state: Any) -> Any:
         index = start.astype(jnp.int32) + jnp.arange(chunk, dtype=jnp.int32)

@@ -11,7 +11,7 @@ from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
 from jaxbox.xla.barriers import materialize
 from jaxbox.xla.components import CellGrids
-from jaxbox.xla.loops import for_chunks
+from jaxbox.xla.loops import for_chunks, whole_chunks
 
 
 def flag_cells(
@@ -39,11 +39,14 @@ def flag_cells(
     """
     size = jax.tree.leaves(columns)[0].shape[0]
     num_rows = jnp.minimum(num_rows, size)  # What fills up the last chunk is no point.
-    row = jnp.arange(_chunk_size(size), dtype=jnp.int32)
+    chunk = _chunk_size(size)
+    whole = whole_chunks(columns, chunk)
+    whole_size = jax.tree.leaves(whole)[0].shape[0]
+    row = jnp.arange(chunk, dtype=jnp.int32)
 
     def step(start: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         table, flags = state
-        part = _chunk(columns, start)
+        part = _chunk(whole, start)
         found = find(materialize(prepare(part)), part, start.astype(jnp.int32) + row < num_rows)
         # One scatter for all maps reads and writes the flags once, which counts in a batch on an accelerator.
         for i, cell in enumerate([jnp.stack(found)] if on_accelerator() else found):
@@ -51,8 +54,8 @@ def flag_cells(
             table = _write(table, jnp.uint32(i), start, cell)
         return table, flags
 
-    table = jnp.zeros((len(cells.shapes), size + -size % _chunk_size(size)), jnp.int32)
-    return _for_chunks(step, (table, jnp.zeros(cells.num_flags, jnp.uint8)), num_rows, size)
+    table = jnp.zeros((len(cells.shapes), whole_size), jnp.int32)
+    return _for_chunks(step, (table, jnp.zeros(cells.num_flags, jnp.uint8)), num_rows, whole_size)
 
 
 def map_tables(
@@ -78,9 +81,10 @@ def map_tables(
       Pytree of (maps, M) arrays.
     """
     num_maps, size = table.shape
+    whole = None if prepare is None else whole_chunks(columns, _chunk_size(size))
 
     def step(start: jax.Array, out: Any) -> Any:
-        shared = None if prepare is None else materialize(prepare(_chunk(columns, start)))
+        shared = None if prepare is None else materialize(prepare(_chunk(whole, start)))
 
         def on_map(i: jax.Array, out: Any) -> Any:
             of_map = jax.lax.dynamic_slice(table, (i, start), (1, _chunk_size(size)))[0]
@@ -89,8 +93,7 @@ def map_tables(
 
         return _for_maps(num_maps, on_map, out)
 
-    capacity = size if columns is None else jax.tree.leaves(columns)[0].shape[0]
-    return _for_chunks(step, init, num_rows, capacity)
+    return _for_chunks(step, init, num_rows, size)
 
 
 def _for_chunks(step: Callable[[jax.Array, Any], Any], init: Any, num_rows: jax.Array, capacity: int) -> Any:
@@ -116,16 +119,10 @@ def _chunk_size(num_rows: int) -> int:
 
 
 def _chunk(columns: Any, start: jax.Array) -> Any:
-    """Rows of a chunk; zeros beyond the last."""
+    """Rows of a chunk, of columns that are whole chunks."""
     if on_accelerator():
         return columns
-
-    def part(values: jax.Array) -> jax.Array:
-        missing = -values.shape[0] % chunks.MAP_POINTS
-        whole = jnp.pad(values, [(0, missing)] + [(0, 0)] * (values.ndim - 1))
-        return jax.lax.dynamic_slice_in_dim(whole, start, chunks.MAP_POINTS)
-
-    return jax.tree.map(part, columns)
+    return jax.tree.map(lambda a: jax.lax.dynamic_slice_in_dim(a, start, chunks.MAP_POINTS), columns)
 
 
 def _write(table: jax.Array, i: jax.Array, start: jax.Array, values: jax.Array) -> jax.Array:
