@@ -194,4 +194,5 @@ def assemble(
     hulls, area = hull.trace_owned(owners, obstacles.xy, kept, config.hull)
     num_points, shapes = descriptors.describe(owners, obstacles.xy, kept, hulls, area)
     found = assembly.Found(sweep, terrain, obstacles, clusters, outlines, completed, candidates, kept)
-    return assembly.assemble(cloud, found, owners, hulls, num_points, shapes, config)
+    first_return_m = evidence.first_returns(segments.evidence, config.evidence)
+    return assembly.assemble(cloud, found, owners, hulls, num_points, shapes, first_return_m, config)

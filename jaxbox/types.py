@@ -293,6 +293,9 @@ class Detections:
     """(N,) int32: connected component of each point in the first map, -1 where it has none."""
     point_detection: jax.Array
     """(N,) int32: row of the box that the point belongs to, -1 where there is none."""
+    first_return_m: jax.Array
+    """(A,) float32, m: range of the first return at a vehicle's height in each azimuth cell, from -pi on, in
+    steps of ``evidence.range_cell_m``; the end of the polar grid where there is none, or no evidence."""
     status: jax.Array
     """() int32: `Status` bits."""
     counts: Counts

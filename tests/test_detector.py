@@ -350,7 +350,8 @@ def test_the_answer_has_the_documented_shapes_and_types():
         "descriptors.eccentricity": ((k,), "float32"), "descriptors.density": ((k,), "float32"),
         "descriptors.complexity": ((k,), "float32"), "ground.coefficients": ((3,), "float32"),
         "ground.found": ((), "bool"), "ground.num_inliers": ((), "int32"), "ground_mask": ((n,), "bool"),
-        "point_component": ((n,), "int32"), "point_detection": ((n,), "int32"), "status": ((), "int32"),
+        "point_component": ((n,), "int32"), "point_detection": ((n,), "int32"),
+        "first_return_m": ((config.evidence.num_azimuths,), "float32"), "status": ((), "int32"),
         "counts.cells": ((maps,), "int32"), "counts.clusters": ((maps,), "int32"),
     }  # fmt: skip
     for field in dataclasses.fields(d.counts):

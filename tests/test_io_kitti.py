@@ -38,6 +38,7 @@ def make_detections(center, size, yaw, score, label, valid=None) -> Detections:
         ground_mask=np.zeros(5, bool),
         point_component=np.zeros(5, np.int32),
         point_detection=np.zeros(5, np.int32),
+        first_return_m=np.zeros(4, np.float32),
         status=np.int32(0),
         counts=empty[Counts],
     )

@@ -20,6 +20,7 @@ NUM_RAYS = parity.CONFIG.completion.num_rays
 
 build_evidence = parity.PerForm(evidence.build_evidence)
 ground_support = jax.jit(evidence.ground_support)
+first_returns = jax.jit(evidence.first_returns)
 
 
 @parity.PerForm
@@ -91,6 +92,22 @@ def test_evidence_differs_in_few_cells_only(cases):
     # A return whose azimuth or range lies on the edge of a cell may round into the next.
     parity.assert_share(*wrong[:2], 1e-4, "hits")
     parity.assert_share(*wrong[2:], 1e-4, "free cells")
+
+
+def test_first_returns_are_those_of_the_reference(cases):
+    for case in cases:
+        expected = reference.first_returns(case.evidence, EVIDENCE)
+        np.testing.assert_array_equal(first_returns(case.evidence_as_input(), EVIDENCE), expected)
+        assert expected.min() >= EVIDENCE.min_range_m - EVIDENCE.range_cell_m
+        assert len(np.unique(expected)) > 50
+
+
+def test_without_evidence_nothing_returned_before_the_end_of_the_grid():
+    end_m = EVIDENCE.num_ranges * EVIDENCE.range_cell_m
+    for module in (evidence, reference):
+        first_return_m = module.first_returns(None, EVIDENCE)
+        assert first_return_m.shape == (EVIDENCE.num_azimuths,)
+        assert (first_return_m == end_m).all()
 
 
 def test_ground_support_is_looked_up_where_the_reference_does(cases):

@@ -62,6 +62,8 @@ class ReferenceDetections:
     """(n,) int: connected component in the first map, -1 where there is none."""
     point_detection: np.ndarray
     """(n,) int: row of the box that the point belongs to, -1 where there is none."""
+    first_return_m: np.ndarray
+    """(azimuths,) m: range of the first return at a vehicle's height."""
     counts: dict[str, Any]
     """The fields of `jaxbox.types.Counts`; a tuple where there is one number a map."""
 
@@ -108,6 +110,7 @@ def assemble(
     hulls: Sequence[np.ndarray],
     num_points: np.ndarray,
     descriptors: Sequence[ShapeDescriptors],
+    first_return_m: np.ndarray,
     config: DetectorConfig,
 ) -> ReferenceDetections:
     """Counts where everything went, and gathers the answer.
@@ -118,6 +121,7 @@ def assemble(
       hulls: (h, 2) m, of the points of k detections.
       num_points: (k,) int, how many they are.
       descriptors: of their shapes.
+      first_return_m: (azimuths,) m.
       config: of the detector.
 
     Returns:
@@ -150,6 +154,7 @@ def assemble(
         ground_mask=ground_mask,
         point_component=component,
         point_detection=point_detection,
+        first_return_m=first_return_m,
         counts=counts,
     )
 

@@ -70,4 +70,5 @@ def detect(
     hulls = hull.convex_hulls(owned)
     num_points, described = shapes.describe(owned, hulls)
     found = assembly.Found(sweep, terrain, obstacles, maps, clusters, completed, candidates, kept)
-    return assembly.assemble(found, owner, hulls, num_points, described, config)
+    first_return_m = evidence.first_returns(seen, config.evidence)
+    return assembly.assemble(found, owner, hulls, num_points, described, first_return_m, config)

@@ -88,6 +88,22 @@ def build_evidence(
     return Evidence(_sums_before(hits), _sums_before(free), support, range_cell_m)
 
 
+def first_returns(evidence: Evidence | None, config: EvidenceConfig) -> np.ndarray:
+    """Range of the first return at a vehicle's height in each azimuth cell.
+
+    Args:
+      evidence: of the sweep; None where there is none.
+      config: that it was built with.
+
+    Returns:
+      (azimuths,) m: where the cell of that return begins; the end of the grid where nothing returned.
+    """
+    if evidence is None:
+        return np.full(config.num_azimuths, config.num_ranges * config.range_cell_m)
+    # All cells before the first return have no return before them, and it has none either.
+    return ((evidence.hit_sums == 0).sum(axis=1) - 1) * evidence.range_cell_m
+
+
 def azimuth_cell(angle: np.ndarray, num_azimuths: int) -> np.ndarray:
     """Azimuth cell of angles in rad, from -pi, all round.
 

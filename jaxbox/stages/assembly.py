@@ -87,6 +87,7 @@ def assemble(
     hulls: Hulls,
     num_points: jax.Array,
     descriptors: Descriptors,
+    first_return_m: jax.Array,
     config: DetectorConfig,
 ) -> Detections:
     """Counts where everything went, and gathers the answer.
@@ -98,6 +99,7 @@ def assemble(
       hulls: of the points of K detections.
       num_points: (K,) int32, how many they are.
       descriptors: of their shapes.
+      first_return_m: (A,) float32, see `Detections`.
       config: of the detector.
 
     Returns:
@@ -127,6 +129,7 @@ def assemble(
         ground_mask=sweep.inlier & (ground.height <= config.ground.min_height_m),
         point_component=nowhere.at[found.obstacles.row].set(found.clusters.component, mode="drop"),
         point_detection=_claim_points(nowhere, owners, found.obstacles, kept.valid.shape[0]),
+        first_return_m=first_return_m,
         status=status,
         counts=counts,
     )

@@ -127,6 +127,24 @@ def build_evidence(
     )
 
 
+def first_returns(evidence: Evidence | None, config: EvidenceConfig) -> jax.Array:
+    """Range of the first return at a vehicle's height in each azimuth cell: what may hide vehicles behind it.
+
+    Args:
+      evidence: of the sweep; None where there is none.
+      config: that the evidence was built with.
+
+    Returns:
+      (A,) float32, m: where the cell of that return begins; the end of the grid where nothing returned.
+
+    Reference: oracle `jaxbox.reference.evidence.first_returns`.
+    """
+    end = jnp.full(config.num_azimuths, config.num_ranges, jnp.int32)
+    if evidence is not None:
+        end = jnp.minimum(next_set(evidence.hit[0], jnp.zeros_like(end)), end)
+    return end.astype(jnp.float32) * config.range_cell_m
+
+
 def azimuth_cell(azimuth: jax.Array, num_azimuths: int) -> jax.Array:
     """Cell of an azimuth.
 
