@@ -20,7 +20,7 @@ PROJECT = ROOT.parent
 LAYERS = [
     {"_version", "_files", "_padding", "config", "types", "geometry", "xla"},
     {"stages"},
-    {"detector"},
+    {"detector", "tracking"},
     {"run"},
     {"io", "evaluation", "viz", "synthetic"},
     {"tuning", "viewer", "cluster"},
@@ -41,6 +41,7 @@ PUBLIC_MODULES = [
     "jaxbox.io",
     "jaxbox.evaluation",
     "jaxbox.run.export",
+    "jaxbox.tracking",
     "jaxbox.tuning",
     "jaxbox.viz",
     "jaxbox.synthetic",

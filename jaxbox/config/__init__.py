@@ -16,6 +16,7 @@ from jaxbox.config.schema import (
     RegionConfig,
     VehicleConfig,
 )
+from jaxbox.config.tracking import TrackConfig
 
 __all__ = [
     "DEFAULT_SCORE_THRESHOLD",
@@ -32,6 +33,7 @@ __all__ = [
     "Label",
     "RegionConfig",
     "Scalar",
+    "TrackConfig",
     "VehicleConfig",
     "propose_capacities",
 ]

@@ -1,0 +1,21 @@
+"""Time: from the detections of successive sweeps to vehicles with an identity, a velocity and a state."""
+
+from jaxbox.config import TrackConfig
+from jaxbox.tracking.state import Observations, TrackerState, observe
+from jaxbox.tracking.step import track_sequence, track_step
+from jaxbox.tracking.tracks import Sight, TrackCounts, Tracks, TrackStatus
+from jaxbox.types import Motion
+
+__all__ = [
+    "Motion",
+    "Observations",
+    "Sight",
+    "TrackConfig",
+    "TrackCounts",
+    "TrackStatus",
+    "TrackerState",
+    "Tracks",
+    "observe",
+    "track_sequence",
+    "track_step",
+]

@@ -1,0 +1,49 @@
+"""Which detection belongs to which track: squared Mahalanobis distance, in two stages, best pairs first."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxbox.config import TrackConfig
+from jaxbox.tracking.state import Observations, Slots
+from jaxbox.xla.assignment import assign_greedily
+
+STAGE_COST = 1e3
+"""Added for detections of a low score: more than any other difference, so that they come second."""
+
+
+def position_variance(center: jax.Array, config: TrackConfig) -> jax.Array:
+    """Variance of detected positions along each axis, which grows with range.
+
+    Args:
+      center: (..., 2 or 3) float32, m, sensor frame.
+      config: of the tracker.
+
+    Returns:
+      (...) float32, m^2.
+    """
+    range_m = jnp.linalg.norm(center[..., :2], axis=-1)
+    return (config.position_sd_m + config.position_sd_grade * range_m) ** 2
+
+
+def associate(slots: Slots, seen: Observations, usable: jax.Array, config: TrackConfig) -> jax.Array:
+    """The detection of each track.
+
+    The cost of a pair is d^2 + log det S with the squared Mahalanobis distance d^2 of the positions; pairs
+    are taken in the order of cost, which equals the best assignment as good as always at 10 Hz.
+
+    Args:
+      slots: T predicted tracks, in the sensor frame of the sweep.
+      seen: D detections.
+      usable: (D,) bool, those to match.
+      config: of the tracker.
+
+    Returns:
+      (T,) int32: row of the detection, D for none.
+    """
+    gap = seen.center[None, :, :2] - slots.position[:, None]
+    variance = position_variance(seen.center, config) + config.placement_sd_m**2
+    variance = slots.covariance[:, None, 0] + variance[None]
+    distance_sq = jnp.sum(gap**2, axis=-1) / variance
+    allowed = slots.alive[:, None] & usable[None] & (distance_sq < config.gate)
+    cost = distance_sq + 2 * jnp.log(variance) + STAGE_COST * (seen.score < config.high_score)[None]
+    return assign_greedily(cost, allowed)

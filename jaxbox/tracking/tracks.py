@@ -1,0 +1,171 @@
+"""What a tracker says of one sweep: its vehicles, what was dropped, and what was wrong with time or pose.
+
+Axis letters: T slots, D detections, L classes. A slot without a vehicle has ``id`` -1 and finite numbers.
+"""
+
+import dataclasses
+import enum
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+FREE = -1
+"""`Tracks.id` of a slot without a vehicle, and `Tracks.detection` of a vehicle that was not detected."""
+
+
+class Sight(enum.IntEnum):
+    """Whether a track was detected in this sweep, and if not, why."""
+
+    SEEN = 0
+    HIDDEN = 1
+    COASTING = 2
+
+
+class TrackStatus(enum.IntFlag):
+    """What happened to the tracks in a sweep. Zero is a clean step; each bit is explained by `describe`."""
+
+    OK = 0
+    TRACK_OVERFLOW = 1
+    TIME_NOT_LATER = 2
+    TIME_GAP = 4
+    POSE_INVALID = 8
+    POSE_JUMP = 16
+    INVALID_DETECTIONS = 32
+    POSE_FROM_BOXES = 64
+    POSE_UNKNOWN = 128
+
+    def describe(self) -> list[str]:
+        """Returns one sentence a set bit: what happened and what to do about it.
+
+        >>> TrackStatus.POSE_UNKNOWN.describe()[0].partition(":")[0]
+        'POSE_UNKNOWN'
+        """
+        return [f"{bit.name}: {_STATUS_TEXT[bit]}" for bit in TrackStatus if bit and bit in self]
+
+
+_STATUS_TEXT = {
+    TrackStatus.TRACK_OVERFLOW: "more vehicles than slots; those with the lowest scores began no track. "
+    "Start with more: TrackerState.empty(max_tracks).",
+    TrackStatus.TIME_NOT_LATER: "the sweep is not later than the one before, or has no time; it was passed "
+    "over and the tracks are as they were. Sort the sweeps by time and drop doubled ones.",
+    TrackStatus.TIME_GAP: "more than TrackConfig.max_gap_s passed since the sweep before; all tracks ended, "
+    "and new ones began.",
+    TrackStatus.POSE_INVALID: "the pose is not finite or no rotation; the carrier was taken to stand. Check "
+    "the source of the poses.",
+    TrackStatus.POSE_JUMP: "the pose moved faster than TrackConfig.max_carrier_speed_mps; all tracks ended, "
+    "and new ones began. Check the source of the poses.",
+    TrackStatus.INVALID_DETECTIONS: "detections with NaN or infinite numbers were left out.",
+    TrackStatus.POSE_FROM_BOXES: "no poses were given, so they were estimated from the boxes, to some "
+    "centimetres a sweep; velocities are as good as that.",
+    TrackStatus.POSE_UNKNOWN: "no poses were given or found, so the carrier was taken to stand: velocities "
+    "are relative to it, and what stands seems to move.",
+}
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class TrackCounts:
+    """True counts of one sweep. Every valid detection is in exactly one of the first six."""
+
+    matched: jax.Array
+    """() int32: detections that belong to a track of the sweep before."""
+    births: jax.Array
+    """() int32: detections that began a track."""
+    dropped_births: jax.Array
+    """() int32: detections that would have begun a track, but no slot was free."""
+    inside_tracks: jax.Array
+    """() int32: detections without a track whose centre lies in a track's box: no new vehicle."""
+    low_scores: jax.Array
+    """() int32: detections without a track whose score is too low to begin one."""
+    invalid: jax.Array
+    """() int32: detections with NaN or infinite numbers."""
+    deaths: jax.Array
+    """() int32: tracks that ended."""
+    tracks: jax.Array
+    """() int32: tracks that live after the sweep."""
+
+    @property
+    def detections(self) -> jax.Array:
+        """() int32: all valid detections of the sweep."""
+        return (
+            self.matched
+            + self.births
+            + self.dropped_births
+            + self.inside_tracks
+            + self.low_scores
+            + self.invalid
+        )
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Tracks:
+    """The vehicles that a tracker knows after one sweep, one a slot."""
+
+    id: jax.Array
+    """(T,) int32: the same for a vehicle in all sweeps, and never used again; -1 for a free slot."""
+    valid: jax.Array
+    """(T,) bool: whether the slot holds a vehicle."""
+    confirmed: jax.Array
+    """(T,) bool: whether it was detected often enough to be shown."""
+    age: jax.Array
+    """(T,) int32: sweeps since its first detection, which counts as 1."""
+    hits: jax.Array
+    """(T,) int32: sweeps in which it was detected."""
+    sight: jax.Array
+    """(T,) int32: a `Sight`."""
+    detection: jax.Array
+    """(T,) int32: row of its detection in this sweep, -1 where it has none."""
+    motion: jax.Array
+    """(T,) int32: a `jaxbox.Motion`."""
+    lateral_shift_m: jax.Array
+    """(T,) float32, m: how far it shifted to the side over the last 5 s, to its left; 0 where it does not
+    change lanes."""
+    label: jax.Array
+    """(T,) int32: the most probable `jaxbox.Label`."""
+    label_probability: jax.Array
+    """(T, L) float32, in [0, 1]: shares of the classes in the scores of its detections."""
+    score: jax.Array
+    """(T,) float32, in [0, 1]: mean score of its detections; where it has one in this sweep, the geometric
+    mean of that and the detection's own, which tells how good this box is."""
+    center: jax.Array
+    """(T, 3) float32, m, sensor frame of this sweep: of the detection's box where there is one, else where
+    the track is expected."""
+    size: jax.Array
+    """(T, 3) float32, m: length, width, height, likewise; of a track of some detections, the length that
+    they agree on, with the faces that this sweep saw where it saw them."""
+    yaw: jax.Array
+    """(T,) float32, rad, in [-pi/2, pi/2): length axis from +x about +z, likewise; of a track of some
+    detections, the one that they agree on."""
+    heading: jax.Array
+    """(T,) float32, rad, in [-pi, pi): where the front points; ``yaw`` or half a turn further."""
+    front_probability: jax.Array
+    """(T,) float32, in [.5, 1]: P(front), that the front is at ``heading`` and not opposite; .5 where the
+    vehicle never moved."""
+    velocity: jax.Array
+    """(T, 2) float32, m/s, over ground, along the axes of this sweep's sensor frame."""
+    turn_rate: jax.Array
+    """(T,) float32, rad/s, about +z."""
+    covariance: jax.Array
+    """(T, 3) float32: variance of position (m^2), covariance of position and velocity (m^2/s), variance of
+    velocity (m^2/s^2), of either axis."""
+    filtered_center: jax.Array
+    """(T, 3) float32, m: of the track's own box, which the detections agree on."""
+    filtered_size: jax.Array
+    """(T, 3) float32, m."""
+    filtered_yaw: jax.Array
+    """(T,) float32, rad, in [-pi/2, pi/2)."""
+    counts: TrackCounts
+    """Where every detection went."""
+    status: jax.Array
+    """() int32: `TrackStatus` bits."""
+
+    @property
+    def speed(self) -> jax.Array:
+        """(T,) float32, m/s, over ground."""
+        return jnp.linalg.norm(self.velocity, axis=-1)
+
+    def on_host(self) -> "Tracks":
+        """The same in NumPy arrays, once they are computed."""
+        return jax.tree.map(np.asarray, self)
