@@ -1,6 +1,7 @@
 """Time: from the detections of successive sweeps to vehicles with an identity, a velocity and a state."""
 
 from jaxbox.config import TrackConfig
+from jaxbox.tracking.smoothing import smooth
 from jaxbox.tracking.state import Observations, TrackerState, observe
 from jaxbox.tracking.step import track_sequence, track_step
 from jaxbox.tracking.tracks import Sight, TrackCounts, Tracks, TrackStatus
@@ -16,6 +17,7 @@ __all__ = [
     "TrackerState",
     "Tracks",
     "observe",
+    "smooth",
     "track_sequence",
     "track_step",
 ]

@@ -27,6 +27,8 @@ SEEN_MIN_STEP_M = 0.05
 """to this."""
 MAX_GROWTH = 1.25
 """What was seen makes a box longer than the mean by this factor at most."""
+SEEN_SHARE = 0.8
+"""A side of which a sweep saw more than this share of the track's is as long as that sweep says."""
 MAX_COURSE_SD = 0.15
 """The course is believed where the velocity's standard deviation is below this share of the speed."""
 FULL_FRONT_SPEED_MPS = 3.0
@@ -147,11 +149,11 @@ def keep_visible_faces(center: jax.Array, size: jax.Array, yaw: jax.Array, new_s
 
 
 def refine_boxes(slots: Slots, seen: Observations) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The boxes of this sweep's detections with what only the track knows: which side is the length, and
-    how long it is.
+    """The boxes of this sweep's detections with what only the track knows: which side is the length, and,
+    where this sweep did not see it, how long it is.
 
-    Where a detection was made, its visible faces are where this sweep saw them, and errors of the poses do
-    not matter. Width and height are its own too: they are seen more often than not.
+    The visible faces stay where this sweep saw them, so that errors of the poses do not matter. Width and
+    height are its own too: they are seen more often than not.
 
     Args:
       slots: T tracks.
@@ -162,7 +164,9 @@ def refine_boxes(slots: Slots, seen: Observations) -> tuple[jax.Array, jax.Array
     """
     crossed = is_crossed(seen.yaw, slots.yaw)[:, None]
     flat = jnp.where(crossed, seen.size[:, 1::-1], seen.size[:, :2])
-    new = jnp.stack([track_size(slots)[:, 0], flat[:, 1]], axis=1)
+    length = track_size(slots)[:, 0]
+    is_seen = ~crossed[:, 0] & (seen.extent[:, 0] > SEEN_SHARE * length)
+    new = jnp.stack([jnp.where(is_seen, flat[:, 0], length), flat[:, 1]], axis=1)
     center = keep_visible_faces(seen.center[:, :2], flat, slots.yaw, new)
     known = slots.hits > MATURE_HITS
     return (
