@@ -2,7 +2,7 @@
 
 Positions are smoothed forward and backward, a track has one size and, where it stands, one yaw, and it goes
 on through short gaps. As in the step, a detection's visible faces stay where its sweep saw them: the size of
-the track is for the sides that the sweep did not see. All of it is float64 in NumPy, in the world of the poses.
+the track is for the sides that the sweep did not see. All is float64 in NumPy, in the world of the poses.
 
 Axis letters: I tracks, L moments, F sweeps.
 """
