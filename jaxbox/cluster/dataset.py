@@ -23,7 +23,7 @@ from jaxbox.cluster.worker import REPORT_KEY, SUFFIX, Partition, PartitionWorker
 from jaxbox.config import DetectorConfig
 from jaxbox.config.checks import check_config
 from jaxbox.config.fields import config_from_toml, config_to_toml, differing_names, recorded_options
-from jaxbox.io._extras import require
+from jaxbox._extras import require
 from jaxbox.run.cache import CacheFolders
 from jaxbox.run.versions import versions
 

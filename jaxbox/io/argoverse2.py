@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxbox._files import InputError, parse_json, read_bytes, read_text, reason
 from jaxbox.io._arrow_sizes import unpacked_bytes
-from jaxbox.io._extras import require
+from jaxbox._extras import require
 from jaxbox.io.labelled import LabelledBoxes, check_count, finite_number, labelled_boxes
 from jaxbox.io.points import (
     PointFormat,

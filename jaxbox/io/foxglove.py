@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxbox._files import InputError, reason
-from jaxbox.io._extras import require
+from jaxbox._extras import require
 from jaxbox.io.points import Points, check_num_points, named_points, record_dtype
 from jaxbox.types import Label
 

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from typing import Any, BinaryIO
 
 from jaxbox._files import InputError, check_file, reason
-from jaxbox.io._extras import require
+from jaxbox._extras import require
 from jaxbox.io._unpack import MAX_CHUNK_BYTES, unpack
 
 McapMessage = tuple[Any, Any, Any]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from jaxbox._files import InputError, atomic_path
-from jaxbox.io._extras import require
+from jaxbox._extras import require
 from jaxbox.io.foxglove import point_cloud, scene_update
 from jaxbox.io.mcap_file import open_mcap_file
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult

@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from jaxbox._files import InputError, check_file, reason
-from jaxbox.io._extras import require
+from jaxbox._extras import require
 from jaxbox.io.points import (
     PointFormat,
     Points,

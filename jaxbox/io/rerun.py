@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxbox._files import atomic_path
 from jaxbox.geometry.projection import project_boxes
-from jaxbox.io._extras import require
+from jaxbox._extras import require
 from jaxbox.io.foxglove import COLORS
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
 from jaxbox.types import Calibration

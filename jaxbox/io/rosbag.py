@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from jaxbox._files import InputError, check_file, reason
-from jaxbox.io._extras import require
+from jaxbox._extras import require
 from jaxbox.io._unpack import open_zstd, unpack
 from jaxbox.io.pointcloud2 import MESSAGE_TYPES, decode_pointcloud2
 from jaxbox.io.points import Points

@@ -9,7 +9,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from jaxbox.io import InputError
-from jaxbox.io._extras import require
+from jaxbox._extras import require
 
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 """Names by which a browser reaches its own machine, also through a forwarded port."""
