@@ -23,7 +23,7 @@ from jaxbox import DetectorConfig, PointCloud, io
 from jaxbox.cli import view as view_command
 from jaxbox.config import propose_capacities
 from jaxbox.config.fields import check_traced
-from jaxbox.io import _extras
+from jaxbox import _extras
 from jaxbox.run import cache
 from jaxbox.run.compiled import count_compilations
 from jaxbox.types import Status

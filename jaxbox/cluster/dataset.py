@@ -16,6 +16,7 @@ from typing import Any
 import jax
 
 from jaxbox import io
+from jaxbox._extras import require
 from jaxbox.cluster.reports import DatasetReport, PartitionReport
 from jaxbox.cluster.sources import SweepRef, list_sweeps
 from jaxbox.cluster.store import Store
@@ -23,7 +24,6 @@ from jaxbox.cluster.worker import REPORT_KEY, SUFFIX, Partition, PartitionWorker
 from jaxbox.config import DetectorConfig
 from jaxbox.config.checks import check_config
 from jaxbox.config.fields import config_from_toml, config_to_toml, differing_names, recorded_options
-from jaxbox.io._extras import require
 from jaxbox.run.cache import CacheFolders
 from jaxbox.run.versions import versions
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from jaxbox import io
-from jaxbox.io._extras import require
+from jaxbox._extras import require
 from jaxbox.io.points import Points
 from jaxbox.io.registry import POINT_FORMATS, format_of
 from jaxbox.io.sweeps import sweep_of

@@ -8,7 +8,7 @@ import uuid
 from collections.abc import Iterator
 from typing import Any, BinaryIO
 
-from jaxbox.io._extras import require
+from jaxbox._extras import require
 
 _PARTIAL = ".part"
 

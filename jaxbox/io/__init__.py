@@ -30,12 +30,13 @@ from jaxbox.io.nuscenes import read_nuscenes
 from jaxbox.io.pandaset import read_pandaset_boxes, read_pandaset_points
 from jaxbox.io.pcd import read_pcd
 from jaxbox.io.ply import read_ply
-from jaxbox.io.points import read_bin, read_text_points, write_bin
+from jaxbox.io.points import TimedPoints, read_bin, write_bin
 from jaxbox.io.recordings import RecordedSweeps
-from jaxbox.io.registry import POINT_SUFFIXES, read_points
+from jaxbox.io.registry import POINT_SUFFIXES, read_points, read_timed_points
 from jaxbox.io.semantic_kitti import read_semantic_labels
 from jaxbox.io.sweep import Sweep
 from jaxbox.io.sweeps import RECORDING_SUFFIXES, open_sweeps
+from jaxbox.io.text_points import read_text_points
 
 __all__ = [
     "POINT_SUFFIXES",
@@ -47,6 +48,7 @@ __all__ = [
     "LevelSweeps",
     "RecordedSweeps",
     "Sweep",
+    "TimedPoints",
     "atomic_path",
     "atomic_writer",
     "boxes_from_objects",
@@ -79,6 +81,7 @@ __all__ = [
     "read_raw_calibration",
     "read_semantic_labels",
     "read_text_points",
+    "read_timed_points",
     "remove_abandoned",
     "write_bin",
     "write_calibration",

@@ -4,8 +4,8 @@ import bz2
 import io
 from typing import Any, BinaryIO
 
+from jaxbox._extras import require
 from jaxbox._files import InputError
-from jaxbox.io._extras import require
 
 MAX_CHUNK_BYTES = 2**27
 """Of one chunk or message of a recording, unpacked; writers make chunks of a few megabytes."""

@@ -11,6 +11,7 @@ Reference: Wilson et al., "Argoverse 2: Next generation datasets for self-drivin
 forecasting", NeurIPS Datasets and Benchmarks 2021.
 """
 
+import dataclasses
 import os
 import pathlib
 import struct
@@ -18,13 +19,15 @@ from typing import Any
 
 import numpy as np
 
+from jaxbox._extras import require
 from jaxbox._files import InputError, parse_json, read_bytes, read_text, reason
 from jaxbox.io._arrow_sizes import unpacked_bytes
-from jaxbox.io._extras import require
 from jaxbox.io.labelled import LabelledBoxes, check_count, finite_number, labelled_boxes
+from jaxbox.io.point_times import TIME_NAMES, timed_points
 from jaxbox.io.points import (
     PointFormat,
     Points,
+    TimedPoints,
     check_num_points,
     check_unpacked,
     named_points,
@@ -48,6 +51,7 @@ _CENTER = ("tx_m", "ty_m", "tz_m")
 _SIZE = ("length_m", "width_m", "height_m")
 _ROTATION = ("qw", "qx", "qy", "qz")
 _MIN_NORM = 0.5
+_COLUMNS = ("x", "y", "z", "intensity")
 
 
 def read_argoverse2_points(
@@ -86,23 +90,69 @@ def read_feather(path: str | os.PathLike[str]) -> Points:
       InputError: where it is not such a table.
       ImportError: without the extra ``arrow``.
     """
-    xyz, intensity = named_points(_read_table(path, ("x", "y", "z", "intensity")), str(path))
+    xyz, intensity = named_points(read_table(path, _COLUMNS), str(path))
+    return seen_from(log_sensor_xyz_m(path), xyz), intensity
+
+
+def read_timed_feather(path: str | os.PathLike[str]) -> TimedPoints:
+    """Reads a sweep of the data set with the times of its points, which it has compensated for.
+
+    Args:
+      path: as `read_feather`; with a column ``offset_ns``, from the time in the file's name.
+
+    Returns:
+      The points; "We have egomotion-compensated the lidar sensor data to the egovehicle reference timestamp"
+      (the data set's own library, on its sweeps).
+
+    Raises:
+      InputError: as `read_feather`, and where the unit of the times is not clear.
+      ImportError: without the extra ``arrow``.
+    """
+    points = timed_points(read_table(path, (*_COLUMNS, *TIME_NAMES)), str(path))
+    xyz = seen_from(log_sensor_xyz_m(path), points.xyz)
+    return dataclasses.replace(points, xyz=xyz, is_compensated=True)
+
+
+def log_sensor_xyz_m(path: str | os.PathLike[str]) -> np.ndarray:
+    """Where the upper LiDAR is in the vehicle's frame, of which points and boxes are seen from there.
+
+    Args:
+      path: a sweep, ``LOG/sensors/lidar/*.feather``.
+
+    Returns:
+      (3,) float64, m: by the log's calibration, or `SENSOR_XYZ_M` where there is none.
+
+    Raises:
+      InputError: where there is a calibration that cannot be read.
+      ImportError: without the extra ``arrow``.
+    """
     calibration = pathlib.Path(os.path.abspath(path)).parents[2:3]
     file = calibration[0] / "calibration" / "egovehicle_SE3_sensor.feather" if calibration else None
-    sensor = _sensor_xyz_m(file) if file is not None and file.is_file() else SENSOR_XYZ_M
-    return seen_from(sensor, xyz), intensity
+    return _sensor_xyz_m(file) if file is not None and file.is_file() else np.array(SENSOR_XYZ_M)
 
 
 def _sensor_xyz_m(path: pathlib.Path) -> np.ndarray:
-    table = _read_table(path, ("sensor_name", *_CENTER))
+    table = read_table(path, ("sensor_name", *_CENTER))
     rows = [i for i, name in enumerate(table.get("sensor_name", [])) if name == "up_lidar"]
     if not rows or any(name not in table for name in _CENTER):
         raise InputError(f"{path}: no row up_lidar with tx_m, ty_m, tz_m; restore the file, or remove it.")
     return np.array([table[name][rows[0]] for name in _CENTER], float)
 
 
-def _read_table(path: str | os.PathLike[str], columns: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """Those of the columns that a Feather table has."""
+def read_table(path: str | os.PathLike[str], columns: tuple[str, ...]) -> dict[str, np.ndarray]:
+    """Reads those of the columns that a Feather table has.
+
+    Args:
+      path: the table.
+      columns: names.
+
+    Returns:
+      The columns that are there.
+
+    Raises:
+      InputError: where it is no such table.
+      ImportError: without the extra ``arrow``.
+    """
     arrow = require("pyarrow", extra="arrow", what="Feather files")
     data = read_bytes(path)
     try:
@@ -215,5 +265,9 @@ def _rotation(entry: Any, where: str) -> np.ndarray:
 
 
 FEATHER = PointFormat(
-    name="Argoverse 2", suffixes=(".feather",), read=read_feather, timestamp_ns=feather_timestamp_ns
+    name="Argoverse 2",
+    suffixes=(".feather",),
+    read=read_feather,
+    read_timed=read_timed_feather,
+    timestamp_ns=feather_timestamp_ns,
 )

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxbox._extras import require
 from jaxbox._files import InputError, reason
-from jaxbox.io._extras import require
-from jaxbox.io.points import Points, check_num_points, named_points, record_dtype
+from jaxbox.io.point_times import timed_points
+from jaxbox.io.points import Points, TimedPoints, check_num_points, named_points, record_dtype
 from jaxbox.types import Label
 
 GOLDEN_TURN = 0.61803398875
@@ -114,11 +115,44 @@ def decode_point_cloud(data: bytes, where: str) -> Points:
       InputError: where the message is damaged, or has no x, y, z.
       ImportError: without the extra ``mcap``.
     """
+    return named_points(_columns(_parsed(data, where), where), where)
+
+
+class PointCloudDecoder:
+    """A serialised ``foxglove.PointCloud``, decoded when it is called."""
+
+    def __init__(self, data: bytes, where: str) -> None:
+        self._data, self._where = data, where
+
+    def __call__(self) -> Points:
+        """Decodes the points; raises as `decode_point_cloud`."""
+        return decode_point_cloud(self._data, self._where)
+
+    def timed(self) -> TimedPoints:
+        """Decodes the points, and when each was measured; raises also where the times' unit is not clear."""
+        cloud = _parsed(self._data, self._where)
+        return timed_points(_columns(cloud, self._where), self._where, sweep_ns=_time_ns(cloud) or None)
+
+    def header(self) -> tuple[int, str]:
+        """The message's time, ns since 1970 or 0, and the name of the points' frame."""
+        cloud = _parsed(self._data, self._where)
+        return _time_ns(cloud), cloud.frame_id
+
+
+def _time_ns(cloud: Any) -> int:
+    return cloud.timestamp.seconds * _NS_PER_S + cloud.timestamp.nanos
+
+
+def _parsed(data: bytes, where: str) -> Any:
     cloud = _schema("PointCloud").PointCloud()
     try:
         cloud.ParseFromString(data)
     except Exception as error:  # protobuf's own error, whose module differs between its versions
         raise InputError(f"{where}: the message cannot be read ({reason(error)}); it is damaged.") from error
+    return cloud
+
+
+def _columns(cloud: Any, where: str) -> dict[str, np.ndarray]:
     fields = {field.name: (_DTYPES.get(field.type, ""), field.offset) for field in cloud.fields}
     fields = {name: (kind, offset) for name, (kind, offset) in fields.items() if kind}
     ends = [offset + np.dtype(kind).itemsize for kind, offset in fields.values()]
@@ -133,7 +167,7 @@ def decode_point_cloud(data: bytes, where: str) -> Points:
         "itemsize": cloud.point_stride,
     }
     points = np.frombuffer(cloud.data, record_dtype(layout, where), count)
-    return named_points({name: points[name] for name in fields}, where)
+    return {name: points[name] for name in fields}
 
 
 def _schema(name: str) -> Any:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxbox._extras import require
 from jaxbox._files import InputError, check_file, reason
-from jaxbox.io._extras import require
 from jaxbox.io.points import (
     PointFormat,
     Points,

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxbox._files import InputError
 from jaxbox.geometry.mounting import Mounting, measure_mounting
-from jaxbox.io.points import Points
+from jaxbox.io.points import Points, TimedPoints
 from jaxbox.io.sweep import Sweep
 from jaxbox.types import Calibration
 
@@ -29,6 +29,11 @@ class LevelSweep(Sweep):
         xyz, intensity = super().read_points()
         return self.mounting.level(xyz), intensity
 
+    def read_timed_points(self) -> TimedPoints:
+        """Reads the points with their times; as `Sweep.read_timed_points`, in the level frame."""
+        points = super().read_timed_points()
+        return dataclasses.replace(points, xyz=self.mounting.level(points.xyz))
+
     def read_calibration(self) -> Calibration | None:
         """Reads the camera; as `Sweep.read_calibration`, seen from the level frame."""
         calibration = super().read_calibration()
@@ -46,15 +51,16 @@ class LevelSweeps(Sequence[LevelSweep]):
     def __init__(self, sweeps: Sequence[Sweep], mounting: Mounting) -> None:
         self.mounting = mounting
         """How the sensor stands, such as `measure_sweeps` finds."""
-        self._sweeps = sweeps
+        self.sweeps = sweeps
+        """The sweeps as they are."""
 
     def __len__(self) -> int:
         """As many as there were."""
-        return len(self._sweeps)
+        return len(self.sweeps)
 
     def __iter__(self) -> Iterator[LevelSweep]:
         """One pass over the sweeps."""
-        return map(self._level, self._sweeps)
+        return map(self._level, self.sweeps)
 
     @overload
     def __getitem__(self, index: int) -> LevelSweep: ...
@@ -63,8 +69,8 @@ class LevelSweeps(Sequence[LevelSweep]):
     def __getitem__(self, index: int | slice) -> LevelSweep | tuple[LevelSweep, ...]:
         """A sweep by its number, or several."""
         if isinstance(index, slice):
-            return tuple(map(self._level, self._sweeps[index]))
-        return self._level(self._sweeps[index])
+            return tuple(map(self._level, self.sweeps[index]))
+        return self._level(self.sweeps[index])
 
     def _level(self, sweep: Sweep) -> LevelSweep:
         fields = {field.name: getattr(sweep, field.name) for field in dataclasses.fields(Sweep)}

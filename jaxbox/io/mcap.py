@@ -4,19 +4,26 @@ A file, or a folder of ROS 2 whose storage is MCAP. `jaxbox.io.mcap_file` finds 
 decoded as in `jaxbox.io.rosbag`.
 """
 
-import functools
 import pathlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from jaxbox.io.foxglove import POINT_CLOUD, decode_point_cloud
+from jaxbox.io.foxglove import POINT_CLOUD, PointCloudDecoder
 from jaxbox.io.mcap_file import McapFile, open_mcap_file
 from jaxbox.io.pointcloud2 import MESSAGE_TYPES
-from jaxbox.io.points import Points
-from jaxbox.io.recordings import Message, RecordedSweeps, RecordingFormat, choose_topic
-from jaxbox.io.rosbag import METADATA_NAME, MessageDecoder
+from jaxbox.io.points import RecordedPoints
+from jaxbox.io.recordings import (
+    POSE_TYPES,
+    Message,
+    PoseMessage,
+    RecordedSweeps,
+    RecordingFormat,
+    choose_topic,
+)
+from jaxbox.io.rosbag import METADATA_NAME, MessageDecoder, decode_message
 
 _SUFFIX = ".mcap"
+_ROS_ENCODINGS = ("cdr", "ros1")
 
 
 def open_mcap(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
@@ -33,6 +40,57 @@ def open_mcap(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
       InputError: where it is not such a file, or the topic has to be named.
       ImportError: without the extra ``mcap``.
     """
+    files, counts, others = _index(path)
+    chosen = choose_topic(path, topic, counts, sorted(others - counts.keys()))
+
+    def messages() -> Iterator[Message]:
+        for file in files:
+            with open_mcap_file(file) as reader:
+                for schema, channel, message in reader.iter_messages([chosen]):
+                    decoder = _decoder_of(schema, channel)
+                    if decoder is not None:
+                        where = f"{file}, {chosen} at {message.log_time}"
+                        yield message.log_time, decoder(message.data, where)
+
+    return RecordedSweeps(path, chosen, counts[chosen], messages)
+
+
+def read_mcap_poses(path: pathlib.Path) -> Iterator[PoseMessage]:
+    """Reads odometry and transforms of ROS from an MCAP file, or from a folder of them.
+
+    Args:
+      path: as `open_mcap`.
+
+    Yields:
+      Those of `POSE_TYPES`, in the order of time.
+
+    Raises:
+      InputError: where it is not such a file, or a message is damaged.
+      ImportError: without the extra ``mcap``.
+    """
+    files, _, _ = _index(path)
+    for file in files:
+        with open_mcap_file(file) as reader:
+            for schema, channel, message in reader.iter_messages(_pose_topics(reader)):
+                name = None if schema is None else POSE_TYPES.get(schema.name)
+                if name is not None and channel.message_encoding in _ROS_ENCODINGS:
+                    where = f"{file}, {channel.topic} at {message.log_time}"
+                    is_ros1 = channel.message_encoding == "ros1"
+                    decoded = decode_message(message.data, name, where, is_ros1=is_ros1)
+                    yield channel.topic, message.log_time, decoded
+
+
+def _pose_topics(reader: McapFile) -> set[str] | None:
+    """Topics with odometry or transforms, by the index; None where the file has none."""
+    summary = reader.summary
+    if summary is None or not summary.channels:
+        return None
+    names = {key: schema.name for key, schema in summary.schemas.items()}
+    return {c.topic for c in summary.channels.values() if names.get(c.schema_id) in POSE_TYPES}
+
+
+def _index(path: pathlib.Path) -> tuple[list[pathlib.Path], dict[str, int], set[str]]:
+    """The files of a recording in the order of time, messages by topic of points, and the other topics."""
     counts: dict[str, int] = {}
     others: set[str] = set()
     starts = {}
@@ -41,20 +99,8 @@ def open_mcap(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
             found, starts[file] = _count_messages(reader, others)
         for name, count in found.items():
             counts[name] = counts.get(name, 0) + count
-    chosen = choose_topic(path, topic, counts, sorted(others - counts.keys()))
     # The names of a long recording's files are numbered, 10 before 2.
-    files = sorted(starts, key=lambda file: starts[file])
-
-    def messages() -> Iterator[Message]:
-        for file in files:
-            with open_mcap_file(file) as reader:
-                for schema, channel, message in reader.iter_messages(chosen):
-                    decoder = _decoder_of(schema, channel)
-                    if decoder is not None:
-                        where = f"{file}, {chosen} at {message.log_time}"
-                        yield message.log_time, decoder(message.data, where)
-
-    return RecordedSweeps(path, chosen, counts[chosen], messages)
+    return sorted(starts, key=lambda file: starts[file]), counts, others
 
 
 def _storage_files(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -88,15 +134,21 @@ def _count_messages(reader: McapFile, others: set[str]) -> tuple[dict[str, int],
     return counts, summary.statistics.message_start_time
 
 
-def _decoder_of(schema: Any, channel: Any) -> Callable[[bytes, str], Callable[[], Points]] | None:
+def _decoder_of(schema: Any, channel: Any) -> Callable[[bytes, str], RecordedPoints] | None:
     """What decodes the messages of a channel; None where they are no points."""
     name = None if schema is None else schema.name
-    if name in MESSAGE_TYPES and channel.message_encoding in ("cdr", "ros1"):
+    if name in MESSAGE_TYPES and channel.message_encoding in _ROS_ENCODINGS:
         is_ros1 = channel.message_encoding == "ros1"
         return lambda data, where: MessageDecoder(data, where, is_ros1)
     if name == POINT_CLOUD and channel.message_encoding == "protobuf":
-        return lambda data, where: functools.partial(decode_point_cloud, data, where)
+        return PointCloudDecoder
     return None
 
 
-MCAP = RecordingFormat(name="MCAP", suffixes=(_SUFFIX,), open=open_mcap, is_folder=is_mcap_folder)
+MCAP = RecordingFormat(
+    name="MCAP",
+    suffixes=(_SUFFIX,),
+    open=open_mcap,
+    read_poses=read_mcap_poses,
+    is_folder=is_mcap_folder,
+)

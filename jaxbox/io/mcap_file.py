@@ -8,11 +8,11 @@ import dataclasses
 import heapq
 import io
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from typing import Any, BinaryIO
 
+from jaxbox._extras import require
 from jaxbox._files import InputError, check_file, reason
-from jaxbox.io._extras import require
 from jaxbox.io._unpack import MAX_CHUNK_BYTES, unpack
 
 McapMessage = tuple[Any, Any, Any]
@@ -88,11 +88,11 @@ class McapFile:
                 summary.chunk_indexes.append(record)
         return summary
 
-    def iter_messages(self, topic: str | None = None) -> Iterator[McapMessage]:
+    def iter_messages(self, topics: Collection[str] | None = None) -> Iterator[McapMessage]:
         """One pass over the messages, a chunk at a time.
 
         Args:
-          topic: the only one wanted; None for all.
+          topics: those wanted; None for all.
 
         Yields:
           Messages in the order of time, or, where the file has no index, in its own order.
@@ -100,7 +100,7 @@ class McapFile:
         schemas, channels = {}, {}
         if self.summary is not None and self.summary.chunk_indexes:
             schemas, channels = dict(self.summary.schemas), dict(self.summary.channels)
-            records = self._indexed_records(topic)
+            records = self._indexed_records(topics)
         else:
             records = self._all_records()
         for record in records:
@@ -110,7 +110,7 @@ class McapFile:
                 channels[record.id] = record
             elif isinstance(record, self._records.Message):
                 channel = channels[record.channel_id]
-                if topic is None or channel.topic == topic:
+                if topics is None or channel.topic in topics:
                     yield schemas[channel.schema_id] if channel.schema_id else None, channel, record
 
     def _all_records(self) -> Iterator[Any]:
@@ -119,9 +119,11 @@ class McapFile:
         for record in self._stream(skip_magic=False):
             yield from self._unpacked(record) if isinstance(record, self._records.Chunk) else (record,)
 
-    def _indexed_records(self, topic: str | None) -> Iterator[Any]:
-        """What is in chunks with that topic, messages in the order of time over chunks that overlap."""
-        wanted = {key for key, channel in self.summary.channels.items() if topic in (None, channel.topic)}
+    def _indexed_records(self, topics: Collection[str] | None) -> Iterator[Any]:
+        """What is in chunks with those topics, messages in the order of time over chunks that overlap."""
+        wanted = {
+            key for key, channel in self.summary.channels.items() if topics is None or channel.topic in topics
+        }
         # Of one time, a chunk comes before its messages, and they stay in their order.
         queue = [
             (chunk.message_start_time, chunk.chunk_start_offset, -1, None)

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxbox._extras import require
 from jaxbox._files import InputError, atomic_path
-from jaxbox.io._extras import require
 from jaxbox.io.foxglove import point_cloud, scene_update
 from jaxbox.io.mcap_file import open_mcap_file
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
@@ -129,7 +129,7 @@ def finished_mcap(path: pathlib.Path) -> frozenset[str]:
     if not path.is_file():
         return frozenset()
     with open_mcap_file(path) as reader:
-        names = [json.loads(message.data)["name"] for _, _, message in reader.iter_messages(RECORDS_TOPIC)]
+        names = [json.loads(message.data)["name"] for _, _, message in reader.iter_messages([RECORDS_TOPIC])]
     if not names or not all(isinstance(name, str) for name in names):
         raise InputError(f"{path}: no MCAP file of jaxbox, as it has no {RECORDS_TOPIC}; move it away.")
     return frozenset(names)

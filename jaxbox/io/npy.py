@@ -13,7 +13,14 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from jaxbox._files import InputError, check_file, reason
-from jaxbox.io.points import PointFormat, Points, check_num_points, check_unpacked, named_points
+from jaxbox.io.point_times import TIME_NAMES, timed_reader
+from jaxbox.io.points import (
+    PointFormat,
+    Points,
+    check_num_points,
+    check_unpacked,
+    named_points,
+)
 
 ARRAY_NAMES = ("points", "xyz", "pointcloud", "data", "arr_0")
 """Arrays that are looked for in a .npz file of several, in this order; its only one needs no name."""
@@ -39,6 +46,10 @@ def read_npy(path: str | os.PathLike[str]) -> Points:
     Raises:
       InputError: where it is not such an array, or is cut short.
     """
+    return named_points(_npy_columns(path), str(path))
+
+
+def _npy_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     check_file(path)
     try:
         # A map, so that a header that claims more than the file holds asks for no memory; and not
@@ -47,11 +58,11 @@ def read_npy(path: str | os.PathLike[str]) -> Points:
             points = np.lib.format.open_memmap(path, mode="r")
     except _READ_ERRORS as error:
         if _is_empty_array(path):
-            return np.zeros((0, 3), np.float32), np.zeros(0, np.float32)
+            return {name: np.zeros(0, np.float32) for name in "xyz"}
         raise InputError(
             f"{path}: no readable .npy array ({reason(error)}); save it again with np.save."
         ) from error
-    return _array_points(points, str(path))
+    return _array_columns(points, str(path))
 
 
 def _is_empty_array(path: str | os.PathLike[str]) -> bool:
@@ -77,6 +88,10 @@ def read_npz(path: str | os.PathLike[str]) -> Points:
     Raises:
       InputError: where it is not such a file, or holds no such array.
     """
+    return named_points(_npz_columns(path), str(path))
+
+
+def _npz_columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     check_file(path)
     try:
         with (
@@ -85,7 +100,7 @@ def read_npz(path: str | os.PathLike[str]) -> Points:
             np.load(file, allow_pickle=False) as arrays,
         ):
             if {"x", "y", "z"} <= set(arrays.files):
-                names = [name for name in _COLUMNS if name in arrays.files]
+                names = [name for name in (*_COLUMNS, *TIME_NAMES) if name in arrays.files]
             else:
                 names = [_array_name(arrays.files, str(path))]
             for name in names:
@@ -99,8 +114,8 @@ def read_npz(path: str | os.PathLike[str]) -> Points:
             f"{path}: no readable .npz file ({reason(error)}); save it again with np.savez."
         ) from error
     if len(found) > 1:
-        return named_points(found, str(path))
-    return _array_points(next(iter(found.values())), str(path))
+        return found
+    return _array_columns(next(iter(found.values())), str(path))
 
 
 def _array_name(names: list[str], where: str) -> str:
@@ -134,17 +149,21 @@ def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:
     return shape, dtype
 
 
-def _array_points(points: np.ndarray, where: str) -> Points:
+def _array_columns(points: np.ndarray, where: str) -> dict[str, np.ndarray]:
     check_num_points(len(points) if points.ndim else 0, where)
     if points.dtype.names and points.ndim == 1:
-        return named_points({name: points[name] for name in points.dtype.names}, where)
+        return {name: points[name] for name in points.dtype.names}
     if points.ndim != 2 or points.shape[1] < len("xyz") or points.dtype.kind not in "fiu":
         raise InputError(
             f"{where}: the array is {points.dtype} of shape {points.shape}; points are (n, 3 or more) real "
             "numbers: x, y, z, intensity."
         )
-    return named_points(dict(zip(_COLUMNS, points.T, strict=False)), where)
+    return dict(zip(_COLUMNS, points.T, strict=False))
 
 
-NPY = PointFormat(name="NumPy array", suffixes=(".npy",), read=read_npy)
-NPZ = PointFormat(name="NumPy archive", suffixes=(".npz",), read=read_npz)
+NPY = PointFormat(
+    name="NumPy array", suffixes=(".npy",), read=read_npy, read_timed=timed_reader(_npy_columns)
+)
+NPZ = PointFormat(
+    name="NumPy archive", suffixes=(".npz",), read=read_npz, read_timed=timed_reader(_npz_columns)
+)

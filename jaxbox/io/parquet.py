@@ -12,8 +12,8 @@ import pathlib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from jaxbox._extras import require
 from jaxbox._files import InputError, atomic_path, reason
-from jaxbox.io._extras import require
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
 
 PARQUET_COLUMNS: Mapping[str, str] = {

@@ -12,8 +12,9 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from jaxbox._extras import require
 from jaxbox._files import InputError, check_file, reason
-from jaxbox.io._extras import require
+from jaxbox.io.point_times import timed_reader
 from jaxbox.io.points import (
     PointFormat,
     Points,
@@ -45,6 +46,10 @@ def read_pcd(path: str | os.PathLike[str]) -> Points:
       InputError: where it is not a PCD file, is cut short, or has no x, y, z.
       ImportError: without the extra ``pcd``.
     """
+    return named_points(_columns(path), str(path))
+
+
+def _columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     pypcd4 = require("pypcd4", extra="pcd", what="PCD files")
     size = check_file(path)
     with pathlib.Path(path).open("rb") as file:
@@ -53,9 +58,9 @@ def read_pcd(path: str | os.PathLike[str]) -> Points:
         check_num_points(header.points, str(path))
         if header.points == 0:
             # pypcd4 makes other than numbers of them under NumPy 1.
-            return named_points({name: np.zeros(0) for name in header.build_dtype().names}, str(path))
+            return {name: np.zeros(0) for name in header.build_dtype().names}
         if header.data.value == "ascii":
-            return named_points(_read_ascii(file, header, str(path)), str(path))
+            return _read_ascii(file, header, str(path))
         _check_body(file, header, size, str(path))
         # The header as it was understood and checked, so that pypcd4 cannot find another one in the file.
         whole = io.BytesIO(header.compose_header().encode() + file.read())
@@ -66,7 +71,7 @@ def read_pcd(path: str | os.PathLike[str]) -> Points:
             raise InputError(
                 f"{path}: the points cannot be read ({reason(error)}); copy it again."
             ) from error
-    return named_points({name: cloud[name] for name in cloud.dtype.names}, str(path))
+    return {name: cloud[name] for name in cloud.dtype.names}
 
 
 def _read_header_lines(file: BinaryIO, where: str) -> list[str]:
@@ -125,4 +130,4 @@ def _read_ascii(file: BinaryIO, header: Any, where: str) -> dict[str, np.ndarray
     return dict(zip(names, rows.T, strict=True))
 
 
-PCD = PointFormat(name="PCD", suffixes=(".pcd",), read=read_pcd)
+PCD = PointFormat(name="PCD", suffixes=(".pcd",), read=read_pcd, read_timed=timed_reader(_columns))

@@ -12,6 +12,7 @@ from typing import BinaryIO
 import numpy as np
 
 from jaxbox._files import InputError, check_file, reason
+from jaxbox.io.point_times import timed_reader
 from jaxbox.io.points import (
     PointFormat,
     Points,
@@ -43,6 +44,10 @@ def read_ply(path: str | os.PathLike[str]) -> Points:
     Raises:
       InputError: where it is not a PLY file, is cut short, has no x, y, z, or does not begin with vertices.
     """
+    return named_points(_columns(path), str(path))
+
+
+def _columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:
     there = check_file(path)
     with pathlib.Path(path).open("rb") as file:
         order, count, dtype = _read_header(file, str(path))
@@ -53,7 +58,7 @@ def read_ply(path: str | os.PathLike[str]) -> Points:
             vertices = np.frombuffer(file.read(size), dtype) if size else np.zeros(0, dtype)
         else:
             vertices = _read_ascii(file, count, dtype, str(path))
-    return named_points({name: vertices[name] for name in dtype.names or ()}, str(path))
+    return {name: vertices[name] for name in dtype.names or ()}
 
 
 def _read_header(file: BinaryIO, where: str) -> tuple[str, int, np.dtype]:
@@ -99,4 +104,4 @@ def _read_ascii(file: BinaryIO, count: int, dtype: np.dtype, where: str) -> np.n
     return vertices
 
 
-PLY = PointFormat(name="PLY", suffixes=(".ply",), read=read_ply)
+PLY = PointFormat(name="PLY", suffixes=(".ply",), read=read_ply, read_timed=timed_reader(_columns))

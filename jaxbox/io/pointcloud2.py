@@ -7,13 +7,24 @@ from typing import Any, Protocol
 import numpy as np
 
 from jaxbox._files import InputError
-from jaxbox.io.points import Points, check_num_bytes, check_num_points, named_points, record_dtype
+from jaxbox.io.point_times import timed_points
+from jaxbox.io.points import (
+    Points,
+    TimedPoints,
+    check_num_bytes,
+    check_num_points,
+    named_points,
+    record_dtype,
+)
 
 MESSAGE_TYPES = ("sensor_msgs/msg/PointCloud2", "sensor_msgs/PointCloud2")
 """Names of the message in ROS 2 and ROS 1."""
 
 _DTYPES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8", "i8", "u8")
 """By the number of `PointField.datatype`."""
+
+
+_NS_PER_S = 10**9
 
 
 class PointField(Protocol):
@@ -28,6 +39,7 @@ class PointField(Protocol):
 class PointCloud2(Protocol):
     """``sensor_msgs/PointCloud2``, whichever library decoded it."""
 
+    header: Any
     height: int
     width: int
     fields: Sequence[Any]
@@ -67,6 +79,38 @@ def decode_pointcloud2(message: PointCloud2, where: str) -> Points:
     Raises:
       InputError: where the data is shorter than the message says, or x, y or z is missing.
     """
+    return named_points(_columns(message, where), where)
+
+
+def decode_timed_pointcloud2(message: PointCloud2, where: str) -> TimedPoints:
+    """Takes the points, and when each was measured, out of a message.
+
+    Args:
+      message: as `decode_pointcloud2`; times count from the stamp of its header.
+      where: recording, topic and time, for the error.
+
+    Returns:
+      The points, without times where no field is named as one of `jaxbox.io.point_times.TIME_NAMES`.
+
+    Raises:
+      InputError: as `decode_pointcloud2`, and where the unit of the times is not clear.
+    """
+    return timed_points(_columns(message, where), where, sweep_ns=stamp_ns(message.header.stamp) or None)
+
+
+def stamp_ns(stamp: Any) -> int:
+    """The time of a header.
+
+    Args:
+      stamp: of a message of ROS 1 or ROS 2.
+
+    Returns:
+      ns since 1970; 0 where it was not set.
+    """
+    return stamp.sec * _NS_PER_S + stamp.nanosec
+
+
+def _columns(message: PointCloud2, where: str) -> dict[str, np.ndarray]:
     check_num_points(message.height * message.width, where)
     # Some drivers leave row_step 0 for clouds of one row.
     row_step = message.row_step or message.width * message.point_step
@@ -79,7 +123,7 @@ def decode_pointcloud2(message: PointCloud2, where: str) -> Points:
     else:
         strides = (layout.row_step, layout.point_step)
         points = np.ndarray((layout.height, layout.width), dtype, data, strides=strides).ravel()
-    return named_points({name: points[name] for name in points.dtype.names or ()}, where)
+    return {name: points[name] for name in points.dtype.names or ()}
 
 
 def _point_dtype(message: PointCloud2, where: str) -> np.dtype:

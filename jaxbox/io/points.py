@@ -1,16 +1,15 @@
-"""Points as the formats share them, and the two formats without a library: KITTI's binary, and text."""
+"""Points as the formats share them, and KITTI's binary, the format without a header."""
 
-import array
 import dataclasses
 import os
 import pathlib
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import numpy as np
 
-from jaxbox._files import MAX_SWEEP_BYTES, InputError, atomic_path, read_bytes, read_text, reason
+from jaxbox._files import MAX_SWEEP_BYTES, InputError, atomic_path, read_bytes, reason
 
 _VALUES_PER_POINT = 4
 _BYTES_PER_POINT = _VALUES_PER_POINT * np.dtype("<f4").itemsize
@@ -25,6 +24,38 @@ INTENSITY_NAMES = ("intensity", "reflectivity", "reflectance", "remission", "sca
 """Names that the formats give to the strength of a return; the first that is there is taken."""
 
 
+@dataclasses.dataclass(frozen=True)
+class TimedPoints:
+    """The points of one sweep, and when each was measured."""
+
+    xyz: np.ndarray
+    """(n, 3) float32, m, sensor frame; NaN and infinity are kept."""
+    intensity: np.ndarray
+    """(n,) float32, the file's own unit; 0 where unknown."""
+    time_s: np.ndarray | None = None
+    """(n,) float64, s from the sweep's own time, or from its first point where the points' clock is another
+    one; None where the source does not say."""
+    is_compensated: bool = False
+    """Whether the source has removed the sensor's own motion, as Argoverse 2 has: then it is not to be
+    removed again."""
+
+
+class RecordedPoints(Protocol):
+    """The points of one message of a recording, decoded when they are asked for."""
+
+    def __call__(self) -> Points:
+        """Decodes the points."""
+        ...
+
+    def timed(self) -> TimedPoints:
+        """Decodes the points, and when each was measured."""
+        ...
+
+    def header(self) -> tuple[int, str]:
+        """The time by the message's own header, ns since 1970 or 0, and the name of the points' frame."""
+        ...
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class PointFormat:
     """A kind of file that holds one sweep."""
@@ -35,6 +66,8 @@ class PointFormat:
     """Lower-case ends of its file names."""
     read: Callable[[pathlib.Path], Points]
     """Reads a file, as `jaxbox.io.read_points`."""
+    read_timed: Callable[[pathlib.Path], TimedPoints] | None = None
+    """Reads a file, as `jaxbox.io.read_timed_points`; None where the format has no times of points."""
     timestamp_ns: Callable[[pathlib.Path], int | None] = lambda _: None
     """When the sweep of a file was taken, ns since 1970, as far as the file's name says; None where it
     does not."""
@@ -252,53 +285,4 @@ def write_bin(path: str | os.PathLike[str], xyz: np.ndarray, intensity: np.ndarr
         temporary.write_bytes(points.tobytes())
 
 
-def read_text_points(path: str | os.PathLike[str]) -> Points:
-    """Reads text points: ``x y z [intensity]`` a line, between them blanks or commas.
-
-    Empty lines and lines that begin with ``#`` are skipped, and so is a first line of column names.
-    Columns after the fourth are ignored.
-
-    Args:
-      path: the file; one without points is a sweep without points.
-
-    Returns:
-      xyz: (n, 3) float32, m, sensor frame.
-      intensity: (n,) float32; 0 where there is no fourth column.
-
-    Raises:
-      InputError: naming file and line, for a line that is not numbers, or has fewer than three columns
-        or another number than the first.
-    """
-    columns, values = 0, array.array("d")
-    for number, line in enumerate(read_text(path).replace(",", " ").splitlines(), start=1):
-        words = line.split()
-        if not words or words[0].startswith("#") or (not columns and _is_header(words)):
-            continue
-        columns = columns or len(words)
-        values.extend(_parse_point(words, columns, f"{path}, line {number}"))
-    points = np.array(values).reshape(-1, _VALUES_PER_POINT)
-    check_num_points(len(points), str(path))
-    # A number beyond float32's range becomes infinite, and is counted by the detector.
-    with np.errstate(over="ignore"):
-        points = points.astype(np.float32)
-    return points[:, :3], points[:, 3]
-
-
-def _is_header(words: list[str]) -> bool:
-    return [word.strip('"').lower() for word in words[:3]] == ["x", "y", "z"]
-
-
-def _parse_point(words: list[str], columns: int, where: str) -> list[float]:
-    if len(words) != columns or columns < _VALUES_PER_POINT - 1:
-        raise InputError(
-            f"{where}: {len(words)} columns; each line needs x y z [intensity], and all lines as many."
-        )
-    try:
-        values = [float(word) for word in words[:_VALUES_PER_POINT]]
-    except ValueError as error:
-        raise InputError(f"{where}: {' '.join(words)[:60]!r} is not x y z [intensity] in numbers.") from error
-    return values if len(values) == _VALUES_PER_POINT else [*values, 0.0]
-
-
 BIN = PointFormat(name="KITTI binary", suffixes=(".bin",), read=read_bin)
-TEXT = PointFormat(name="text", suffixes=(".txt", ".csv", ".xyz"), read=read_text_points)

@@ -8,14 +8,30 @@ import difflib
 import itertools
 import pathlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import overload
+from typing import Any, overload
 
 from jaxbox._files import InputError
-from jaxbox.io.points import Points
+from jaxbox.io.points import RecordedPoints
 from jaxbox.io.sweep import Sweep
 
-Message = tuple[int, Callable[[], Points]]
+Message = tuple[int, RecordedPoints]
 """Time in ns, and what decodes the points."""
+
+PoseMessage = tuple[str, int, Any]
+"""Topic, time in ns at which it was recorded, and a message of `POSE_TYPES`."""
+
+ODOMETRY = "nav_msgs/msg/Odometry"
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+POSE_TYPES: Mapping[str, str] = {
+    ODOMETRY: ODOMETRY,
+    "nav_msgs/Odometry": ODOMETRY,
+    TF_MESSAGE: TF_MESSAGE,
+    "tf2_msgs/TFMessage": TF_MESSAGE,
+    # Before tf2 ROS 1 had the same message under another name.
+    "tf/msg/tfMessage": TF_MESSAGE,
+    "tf/tfMessage": TF_MESSAGE,
+}
+"""Messages that say where something is, by the names that recordings give them."""
 
 _MAX_NAMED = 12
 
@@ -30,6 +46,8 @@ class RecordingFormat:
     """Lower-case ends of its file names."""
     open: Callable[[pathlib.Path, str | None], "RecordedSweeps"]
     """Opens one by its path and the topic to take, None for the only one."""
+    read_poses: Callable[[pathlib.Path], Iterator[PoseMessage]]
+    """Reads its odometry and transforms, in the order of time."""
     is_folder: Callable[[pathlib.Path], bool] = lambda _: False
     """Whether a folder is one of them."""
 
@@ -59,7 +77,7 @@ class RecordedSweeps(Sequence[Sweep]):
         """One pass over the recording."""
         for index, (timestamp_ns, decode) in enumerate(self._messages()):
             name = f"{self.path.stem}_{index:06d}"
-            yield Sweep(name, self.path, timestamp_ns=timestamp_ns, decode=decode)
+            yield Sweep(name, self.path, timestamp_ns=timestamp_ns, sequence=self.path.stem, decode=decode)
 
     @overload
     def __getitem__(self, index: int) -> Sweep: ...

@@ -13,7 +13,8 @@ from jaxbox.io.npy import NPY, NPZ
 from jaxbox.io.nuscenes import NUSCENES
 from jaxbox.io.pcd import PCD
 from jaxbox.io.ply import PLY
-from jaxbox.io.points import BIN, TEXT, PointFormat, Points
+from jaxbox.io.points import BIN, PointFormat, Points, TimedPoints
+from jaxbox.io.text_points import TEXT
 
 POINT_FORMATS: tuple[PointFormat, ...] = (BIN, NUSCENES, PCD, PLY, LAS, NPY, NPZ, FEATHER, TEXT)
 """Formats in the order in which a folder is searched for them."""
@@ -58,10 +59,33 @@ def read_points(path: str | os.PathLike[str]) -> Points:
       InputError: for another suffix, or naming the file and the fix where it cannot be read.
       ImportError: naming the extra that the format needs, where that is not installed.
     """
+    return _known_format(path).read(pathlib.Path(path))
+
+
+def read_timed_points(path: str | os.PathLike[str]) -> TimedPoints:
+    """Reads one sweep and when each of its points was measured, in the format that its suffix says.
+
+    Args:
+      path: a file of one of `POINT_FORMATS`.
+
+    Returns:
+      The points, without times where the file has none; see `jaxbox.io.point_times` for names and units.
+
+    Raises:
+      InputError: as `read_points`, and where the unit of the times is not clear.
+      ImportError: naming the extra that the format needs, where that is not installed.
+    """
+    found = _known_format(path)
+    if found.read_timed is None:
+        return TimedPoints(*found.read(pathlib.Path(path)))
+    return found.read_timed(pathlib.Path(path))
+
+
+def _known_format(path: str | os.PathLike[str]) -> PointFormat:
     found = format_of(path)
     if found is None:
         raise InputError(
             f"{path}: not a known kind of points; give one of {', '.join(POINT_SUFFIXES)}, or a recording "
             "to open_sweeps."
         )
-    return found.read(pathlib.Path(path))
+    return found

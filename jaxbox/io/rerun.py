@@ -12,9 +12,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxbox._extras import require
 from jaxbox._files import atomic_path
 from jaxbox.geometry.projection import project_boxes
-from jaxbox.io._extras import require
 from jaxbox.io.foxglove import COLORS
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
 from jaxbox.types import Calibration

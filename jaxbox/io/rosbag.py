@@ -13,12 +13,20 @@ import urllib.parse
 from collections.abc import Iterator
 from typing import Any
 
+from jaxbox._extras import require
 from jaxbox._files import InputError, check_file, reason
-from jaxbox.io._extras import require
 from jaxbox.io._unpack import open_zstd, unpack
-from jaxbox.io.pointcloud2 import MESSAGE_TYPES, decode_pointcloud2
-from jaxbox.io.points import Points
-from jaxbox.io.recordings import Message, RecordedSweeps, RecordingFormat, choose_topic
+from jaxbox.io.pointcloud2 import MESSAGE_TYPES, decode_pointcloud2, decode_timed_pointcloud2, stamp_ns
+from jaxbox.io.points import Points, TimedPoints
+from jaxbox.io.recordings import (
+    POSE_TYPES,
+    TF_MESSAGE,
+    Message,
+    PoseMessage,
+    RecordedSweeps,
+    RecordingFormat,
+    choose_topic,
+)
 
 METADATA_NAME = "metadata.yaml"
 """What a folder of ROS 2 holds besides its storage."""
@@ -52,13 +60,31 @@ def open_rosbag(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
     def messages() -> Iterator[Message]:
         with _reader(path) as reader:
             connections = [c for c in reader.connections if c.topic == chosen and c.msgtype == _TYPE]
-            is_packed = getattr(reader, "compression_mode", None) == _PACKED_MESSAGES
-            for _, timestamp_ns, data in _raw_messages(reader, connections):
-                where = f"{path}, {chosen} at {timestamp_ns}"
-                message = unpack(data, "zstd", where) if is_packed else data
-                yield timestamp_ns, MessageDecoder(message, where, _is_ros1(path))
+            for _, timestamp_ns, data, where in _messages(reader, connections, path):
+                yield timestamp_ns, MessageDecoder(data, where, _is_ros1(path))
 
     return RecordedSweeps(path, chosen, counts[chosen], messages)
+
+
+def read_rosbag_poses(path: pathlib.Path) -> Iterator[PoseMessage]:
+    """Reads odometry and transforms of a bag.
+
+    Args:
+      path: as `open_rosbag`.
+
+    Yields:
+      Those of `POSE_TYPES`, in the order of time.
+
+    Raises:
+      InputError: where it is not a bag, or a message is damaged.
+      ImportError: without the extra ``ros``.
+    """
+    with _reader(path) as reader:
+        connections = [c for c in reader.connections if c.msgtype in POSE_TYPES]
+        for connection, timestamp_ns, data, where in _messages(reader, connections, path):
+            name = POSE_TYPES[connection.msgtype]
+            message = decode_message(data, name, where, is_ros1=_is_ros1(path))
+            yield connection.topic, timestamp_ns, message
 
 
 def _is_ros1(path: pathlib.Path) -> bool:
@@ -114,11 +140,18 @@ def _bound_chunks(reader: Any, where: str) -> None:
         reader.chunks[position] = chunk._replace(decompressor=bounded)
 
 
-def _raw_messages(reader: Any, connections: Any) -> Iterator[Any]:
-    """Messages of a bag, as they are stored: the library would unpack those of ROS 2 without a bound."""
-    if getattr(reader, "compression_mode", None) == _PACKED_MESSAGES:
+def _messages(reader: Any, connections: Any, path: pathlib.Path) -> Iterator[tuple[Any, int, bytes, str]]:
+    """Connection, time and bytes of a bag's messages, and where each is, for errors.
+
+    Packed messages of ROS 2 are unpacked here: the library would do so without a bound.
+    """
+    is_packed = getattr(reader, "compression_mode", None) == _PACKED_MESSAGES
+    if is_packed:
         reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
-    return reader.messages(connections)
+    # The library takes an empty list for all connections.
+    for connection, timestamp_ns, data in reader.messages(connections) if connections else ():
+        where = f"{path}, {connection.topic} at {timestamp_ns}"
+        yield connection, timestamp_ns, unpack(data, "zstd", where) if is_packed else data, where
 
 
 def _check_packed_files(path: pathlib.Path) -> None:
@@ -148,23 +181,55 @@ class MessageDecoder:
           InputError: naming recording, topic and time.
           ImportError: without the extra ``ros``.
         """
-        store = _typestore(self._is_ros1)
-        deserialize = store.deserialize_ros1 if self._is_ros1 else store.deserialize_cdr
-        try:
-            message = deserialize(self._data, _TYPE)
-        # The library's own errors, or what generated code meets in too few bytes.
-        except Exception as error:
-            raise InputError(
-                f"{self._where}: the message cannot be read ({reason(error)}); it is damaged."
-            ) from error
-        return decode_pointcloud2(message, self._where)
+        return decode_pointcloud2(self._message(), self._where)
+
+    def timed(self) -> TimedPoints:
+        """Decodes the points, and when each was measured; raises as a call."""
+        return decode_timed_pointcloud2(self._message(), self._where)
+
+    def header(self) -> tuple[int, str]:
+        """The header's time, ns since 1970 or 0, and the name of the points' frame; raises as a call."""
+        header = self._message().header
+        return stamp_ns(header.stamp), header.frame_id
+
+    def _message(self) -> Any:
+        return decode_message(self._data, _TYPE, self._where, is_ros1=self._is_ros1)
+
+
+def decode_message(data: bytes, name: str, where: str, *, is_ros1: bool) -> Any:
+    """Decodes a message by the library's own definition.
+
+    Args:
+      data: serialised.
+      name: of its type in ROS 2, as ``sensor_msgs/msg/PointCloud2``.
+      where: recording, topic and time, for the error.
+      is_ros1: whether it is serialised as in ROS 1, or in CDR as in ROS 2.
+
+    Returns:
+      The message as the library has it.
+
+    Raises:
+      InputError: where it is damaged.
+      ImportError: without the extra ``ros``.
+    """
+    store = _typestore(is_ros1)
+    deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+    try:
+        return deserialize(data, name)
+    # The library's own errors, or what generated code meets in too few bytes.
+    except Exception as error:
+        raise InputError(f"{where}: the message cannot be read ({reason(error)}); it is damaged.") from error
 
 
 @functools.cache
 def _typestore(is_ros1: bool) -> Any:
     """The definitions of all messages, which take longer to gather than a message to decode."""
     typesys = require("rosbags.typesys", extra="ros", what="ROS messages")
-    return typesys.get_typestore(typesys.Stores.ROS1_NOETIC if is_ros1 else typesys.Stores.ROS2_HUMBLE)
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if is_ros1 else typesys.Stores.ROS2_HUMBLE)
+    if TF_MESSAGE not in store.types:
+        # tf2_msgs is not among the library's definitions of ROS 1.
+        store.register(typesys.get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF_MESSAGE))
+    return store
 
 
 def is_rosbag2(path: pathlib.Path) -> bool:
@@ -173,5 +238,9 @@ def is_rosbag2(path: pathlib.Path) -> bool:
 
 
 ROSBAG = RecordingFormat(
-    name="ROS 1 and ROS 2 bags", suffixes=(".bag", _DATABASE), open=open_rosbag, is_folder=is_rosbag2
+    name="ROS 1 and ROS 2 bags",
+    suffixes=(".bag", _DATABASE),
+    open=open_rosbag,
+    read_poses=read_rosbag_poses,
+    is_folder=is_rosbag2,
 )

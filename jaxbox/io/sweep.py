@@ -3,7 +3,6 @@
 import dataclasses
 import os
 import pathlib
-from collections.abc import Callable
 
 import numpy as np
 
@@ -11,8 +10,8 @@ from jaxbox._files import InputError
 from jaxbox.io.images import read_image, read_image_size
 from jaxbox.io.kitti import KittiObject, read_labels
 from jaxbox.io.kitti_calibration import IMAGE_SIZE_PX, read_calibration, read_raw_calibration
-from jaxbox.io.points import Points
-from jaxbox.io.registry import read_points
+from jaxbox.io.points import Points, RecordedPoints, TimedPoints
+from jaxbox.io.registry import read_points, read_timed_points
 from jaxbox.types import Calibration
 
 _END_OF_TIME_NS = 2**63
@@ -38,7 +37,10 @@ class Sweep:
     timestamp_ns: int | None = None
     """When it was taken, ns since 1970, as far as file name or recording say; None where they do not, or
     where it is before 1970 or after 2262, which the results' integers of 64 bits end with."""
-    decode: Callable[[], Points] | None = dataclasses.field(default=None, repr=False, compare=False)
+    sequence: str | None = None
+    """The drive that it belongs to: "0000" (tracking), the raw drive, nuScenes' log, Argoverse 2's log, the
+    recording's name, or the folder's; None where that is not known."""
+    decode: RecordedPoints | None = dataclasses.field(default=None, repr=False, compare=False)
     """Decodes the points of a sweep within a recording; None where `points_path` holds this sweep alone."""
 
     def __post_init__(self) -> None:
@@ -54,8 +56,10 @@ class Sweep:
                 "rename the file, or give a name without folders."
             )
         # Bytes of a file's name that are not UTF-8 can neither be printed nor written.
-        printable = os.fsencode(self.name).decode("utf-8", "backslashreplace")
-        object.__setattr__(self, "name", printable)
+        for field in ("name", "sequence"):
+            if (text := getattr(self, field)) is not None:
+                printable = os.fsencode(text).decode("utf-8", "backslashreplace")
+                object.__setattr__(self, field, printable)
         if self.timestamp_ns is not None and not 0 <= self.timestamp_ns < _END_OF_TIME_NS:
             object.__setattr__(self, "timestamp_ns", None)
 
@@ -71,6 +75,19 @@ class Sweep:
           ImportError: naming the extra that its format needs, where that is not installed.
         """
         return read_points(self.points_path) if self.decode is None else self.decode()
+
+    def read_timed_points(self) -> TimedPoints:
+        """Reads the points, and when each was measured.
+
+        Returns:
+          As `read_points`, with ``time_s`` (n,) float64, s from the sweep's time; None where the source does
+          not say. See `jaxbox.io.TimedPoints`.
+
+        Raises:
+          InputError: naming the file, where it cannot be read, or the unit of the times is not clear.
+          ImportError: naming the extra that its format needs, where that is not installed.
+        """
+        return read_timed_points(self.points_path) if self.decode is None else self.decode.timed()
 
     def read_calibration(self) -> Calibration | None:
         """Reads the calibration of the left colour camera.

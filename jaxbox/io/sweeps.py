@@ -30,11 +30,12 @@ from jaxbox._files import InputError, check_file, read_text
 from jaxbox.io.kitti import tracking_name
 from jaxbox.io.kitti_calibration import RAW_CALIBRATION_FILES
 from jaxbox.io.mcap import MCAP
-from jaxbox.io.points import TEXT, PointFormat
+from jaxbox.io.points import PointFormat
 from jaxbox.io.recordings import RecordedSweeps, RecordingFormat
 from jaxbox.io.registry import POINT_FORMATS, POINT_SUFFIXES, format_of, suffix_of
 from jaxbox.io.rosbag import ROSBAG
 from jaxbox.io.sweep import Sweep
+from jaxbox.io.text_points import TEXT
 
 RECORDING_FORMATS: tuple[RecordingFormat, ...] = (MCAP, ROSBAG)
 """The recordings that `open_sweeps` knows; a folder of ROS 2 whose storage is MCAP is read as MCAP."""
@@ -83,7 +84,7 @@ def open_sweeps(path: PathLike | Sequence[PathLike], *, topic: str | None = None
     parts = [part for item in paths for found in _expand(item) for part in _open_path(found, topic)]
     if all(isinstance(part, tuple) for part in parts):
         return _distinct([sweep for part in parts for sweep in part])
-    return parts[0] if len(parts) == 1 else _Chain(parts)
+    return parts[0] if len(parts) == 1 else ChainedSweeps(parts)
 
 
 def sweep_of(file: pathlib.Path) -> Sweep:
@@ -114,7 +115,7 @@ def _expand(path: PathLike) -> list[pathlib.Path]:
 
 def _open_path(path: pathlib.Path, topic: str | None) -> list[Sequence[Sweep]]:
     """The sweeps of one path: point files as a tuple, recordings each by itself."""
-    if recording := _recording_format(path):
+    if recording := recording_format(path):
         return [recording.open(path, topic)]
     if path.is_file():
         if format_of(path) is None:
@@ -128,7 +129,7 @@ def _open_path(path: pathlib.Path, topic: str | None) -> list[Sequence[Sweep]]:
     if files := _find_points(path, POINT_FORMATS[:-1]):
         return [tuple(_sweep_at(file) for file in files)]
     # Text comes last: it may as well be somebody's notes.
-    if recordings := [file for file in sorted(path.iterdir()) if _recording_format(file)]:
+    if recordings := [file for file in sorted(path.iterdir()) if recording_format(file)]:
         return [part for file in recordings for part in _open_path(file, topic)]
     if files := _find_points(path, (TEXT,)):
         return [tuple(_sweep_at(file) for file in files)]
@@ -138,7 +139,15 @@ def _open_path(path: pathlib.Path, topic: str | None) -> list[Sequence[Sweep]]:
     )
 
 
-def _recording_format(path: pathlib.Path) -> RecordingFormat | None:
+def recording_format(path: pathlib.Path) -> RecordingFormat | None:
+    """The kind of recording that a file or folder is.
+
+    Args:
+      path: of either.
+
+    Returns:
+      The format, or None where it is no recording.
+    """
     if path.name.startswith("."):
         return None
     suffix = suffix_of(path, RECORDING_SUFFIXES) if path.is_file() else None
@@ -172,7 +181,7 @@ def _check_distinct(names: Sequence[str], paths: Sequence[pathlib.Path]) -> None
         first[name] = path
 
 
-class _Chain(Sequence[Sweep]):
+class ChainedSweeps(Sequence[Sweep]):
     """Several recordings, or recordings and files, one after the other."""
 
     def __init__(self, parts: Sequence[Sequence[Sweep]]) -> None:
@@ -242,7 +251,24 @@ def _sweep_at(file: pathlib.Path) -> Sweep:
     found = format_of(file)
     suffix = suffix_of(file, POINT_SUFFIXES) or ""
     timestamp_ns = None if found is None else found.timestamp_ns(file)
-    return Sweep(file.name[: len(file.name) - len(suffix)], file, timestamp_ns=timestamp_ns)
+    return Sweep(
+        name=file.name[: len(file.name) - len(suffix)],
+        points_path=file,
+        timestamp_ns=timestamp_ns,
+        sequence=_sequence_of(file),
+    )
+
+
+def _sequence_of(file: pathlib.Path) -> str | None:
+    """The drive of a file that is not KITTI's: nuScenes' or Argoverse 2's log, or the folder."""
+    log, _, channel = file.name.partition("__")
+    if channel.startswith("LIDAR_TOP"):
+        return log
+    folder = file.parent
+    if (folder.parent.name, folder.name) == ("sensors", "lidar"):
+        folder = folder.parent.parent
+    # The root of a file system has no name.
+    return folder.name or None
 
 
 def _object_sweep(file: pathlib.Path, root: pathlib.Path) -> Sweep:
@@ -252,6 +278,7 @@ def _object_sweep(file: pathlib.Path, root: pathlib.Path) -> Sweep:
         calibration_path=_existing(root / "calib" / f"{file.stem}.txt"),
         labels_path=_existing(root / "label_2" / f"{file.stem}.txt"),
         image_path=_image(root / "image_2", file.stem),
+        sequence=root.name or None,
     )
 
 
@@ -264,6 +291,7 @@ def _tracking_sweep(file: pathlib.Path, root: pathlib.Path) -> Sweep:
         labels_path=_existing(root / "label_02" / f"{sequence}.txt"),
         image_path=_image(root / "image_02" / sequence, file.stem),
         frame=frame,
+        sequence=sequence,
     )
 
 
@@ -276,6 +304,7 @@ def _raw_sweep(file: pathlib.Path, drive: pathlib.Path) -> Sweep:
         calibration_path=drive.parent if calibrated else None,
         image_path=_image(drive / "image_02" / "data", file.stem),
         timestamp_ns=_raw_time_ns(file),
+        sequence=drive.name or None,
     )
 
 

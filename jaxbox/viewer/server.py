@@ -8,8 +8,8 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 from urllib.parse import urlsplit
 
+from jaxbox._extras import require
 from jaxbox.io import InputError
-from jaxbox.io._extras import require
 
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
 """Names by which a browser reaches its own machine, also through a forwarded port."""

@@ -1,4 +1,4 @@
-"""Libraries that only some formats need, and the extra that brings each of them."""
+"""Libraries that only some formats and methods need, and the extra that brings each of them."""
 
 import importlib
 from typing import Any
