@@ -40,6 +40,7 @@ PUBLIC_MODULES = [
     "jaxbox.cluster",
     "jaxbox.io",
     "jaxbox.evaluation",
+    "jaxbox.evaluation.tracking",
     "jaxbox.run.export",
     "jaxbox.tuning",
     "jaxbox.viz",
