@@ -290,6 +290,7 @@ LABELS = {
     "object": f"{LABEL}\n{LABEL} 0.5\nDontCare -1 -1 -10 1 2 3 4 -1 -1 -1 -1000 -1000 -1000 -10\n".encode(),
     "tracking": f"0 -1 {LABEL}\n1 7 {LABEL}\n".encode(),
 }
+TRACK_DETECTION = "3,2,298.3,165.1,458.2,293.4,8.2,1.96,1.81,4.75,-4.57,1.84,13.5,-2.11,-1.78"
 IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0"
 CALIBRATION = (
     f"P2: 700 0 600 45 0 700 180 0 0 0 1 0\nR0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: {IDENTITY}\n"
@@ -423,6 +424,10 @@ TARGETS: Mapping[str, Target] = {
     ),
     "semantic_labels": Target("a.label", io.read_semantic_labels, lambda: {"labels": bytes(range(48))}),
     "kitti_labels": Target("a.txt", read_label_lines, lambda: LABELS),
+    "kitti_tracks": Target("0000.txt", io.read_tracks, lambda: {"tracks": LABELS["tracking"]}),
+    "kitti_track_detections": Target(
+        "0000.txt", io.read_track_detections, lambda: {"detections": f"{TRACK_DETECTION}\n".encode() * 2}
+    ),
     "kitti_calibration": Target("a.txt", io.read_calibration, lambda: {"calib": CALIBRATION.encode()}),
     "kitti_raw_velo_to_cam": raw_calibration_target("calib_velo_to_cam.txt"),
     "kitti_raw_cam_to_cam": raw_calibration_target("calib_cam_to_cam.txt"),

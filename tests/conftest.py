@@ -19,6 +19,7 @@ FAST = {
     "test_config_fields.py", "test_conventions.py", "test_docs.py", "test_evaluation_beams.py",
     "test_evaluation_corruptions.py", "test_evaluation_iou.py", "test_evaluation_kitti.py",
     "test_evaluation_objectives.py", "test_evaluation_report.py", "test_evaluation_sizes.py",
+    "test_evaluation_tracking.py", "test_io_kitti_tracking.py",
     "test_fuzz_readers.py", "test_geometry.py", "test_hostile_files.py", "test_io_drives.py",
     "test_io_files.py", "test_io_formats.py", "test_io_kitti.py", "test_io_other_sensors.py",
     "test_packaging.py", "test_paper_table.py", "test_reference.py", "test_reliability_benchmarks.py",

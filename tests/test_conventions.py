@@ -41,6 +41,7 @@ PUBLIC_MODULES = [
     "jaxbox.cluster",
     "jaxbox.io",
     "jaxbox.evaluation",
+    "jaxbox.evaluation.tracking",
     "jaxbox.run.export",
     "jaxbox.tracking",
     "jaxbox.tuning",

@@ -13,7 +13,7 @@ from jaxbox.cli.console import cache_warnings, input_errors, stdout
 from jaxbox.cli.demo import run_demo
 from jaxbox.cli.detect import DetectOptions, ResultFormat, run_detect
 from jaxbox.cli.detect_ray import RayOptions, run_detect_ray
-from jaxbox.cli.evaluate import run_eval
+from jaxbox.cli.eval_command import DrivesOption, evaluate
 from jaxbox.cli.export import Platform, run_export
 from jaxbox.cli.info import print_info
 from jaxbox.cli.report import SHOWN_MIN_SCORE
@@ -56,9 +56,6 @@ SetOption = Annotated[
         help="Change one setting by its name; repeatable.",
         autocompletion=complete_setting,
     ),
-]
-DrivesOption = Annotated[
-    pathlib.Path | None, typer.Option(help='Text file of the drive of each frame: "frame drive" a line.')
 ]
 TopicOption = Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")]
 
@@ -307,44 +304,7 @@ def detect(
         raise typer.Exit(run_detect(paths, options))
 
 
-@app.command("eval", epilog=EXIT_CODES)
-def evaluate(
-    *,
-    labels: Annotated[pathlib.Path, typer.Option(help="The KITTI folder that was given to `detect`.")],
-    results: Annotated[pathlib.Path, typer.Option(help="The folder that `detect` wrote to.")],
-    json: Annotated[pathlib.Path | None, typer.Option(help="Also write every figure to this file.")] = None,
-    plots: Annotated[
-        pathlib.Path | None,
-        typer.Option(help="Folder for the plots (the plots extra); RESULTS/plots unless given."),
-    ] = None,
-    pictures: Annotated[
-        bool, typer.Option("--pictures", help="Draw what was found, missed and false: RESULTS/pictures.")
-    ] = False,
-    min_score: Annotated[
-        float,
-        typer.Option(min=0.0, max=1.0, help="Draw no lower scores; the figures take all."),
-    ] = SHOWN_MIN_SCORE,
-    drives: DrivesOption = None,
-    missing_as_empty: Annotated[
-        bool, typer.Option("--missing-as-empty", help="Take a missing result file for one without boxes.")
-    ] = False,
-) -> None:
-    """Score results against labels: the paper's size errors, recall and precision, KITTI's AP.
-
-    Pictures are RESULTS/pictures/NAME_eval.png and contact_sheet.png, all frames on one.
-    """
-    with input_errors():
-        run_eval(
-            labels,
-            results,
-            missing_as_empty=missing_as_empty,
-            json_path=json,
-            plots=plots,
-            drives_path=drives,
-            pictures=pictures,
-            min_score=min_score,
-            console=stdout(),
-        )
+app.command("eval", epilog=EXIT_CODES)(evaluate)
 
 
 @app.command(epilog=EXIT_CODES)

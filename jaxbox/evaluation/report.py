@@ -120,8 +120,29 @@ def _read_results(
     folder: pathlib.Path, names: Sequence[str], *, missing_as_empty: bool
 ) -> dict[str, list[KittiObject] | None]:
     """Results of each frame; None where the file is missing."""
+    files = find_results(folder, names, missing_as_empty=missing_as_empty)
+    return {name: None if file is None else _read_scored(file) for name, file in files.items()}
+
+
+def find_results(
+    folder: pathlib.Path, names: Sequence[str], *, missing_as_empty: bool = False, what: str = "sweeps"
+) -> dict[str, pathlib.Path | None]:
+    """Finds the result file of each labelled sweep or sequence.
+
+    Args:
+      folder: of ``NAME.txt``, or of ``data/NAME.txt``.
+      names: of the labelled ones.
+      missing_as_empty: whether one without a file is taken for one without results.
+      what: the names are of, for the message.
+
+    Returns:
+      The file of each; None where it is missing.
+
+    Raises:
+      InputError: for a missing folder or a missing file.
+    """
     if not folder.is_dir():
-        raise InputError(f"{folder}: there is no such folder; give the one that `jaxbox detect` wrote to.")
+        raise InputError(f"{folder}: there is no such folder; give the one that the results were written to.")
     # The official layout: results under data/, next to statistics that are text files too.
     if not any((folder / f"{name}.txt").is_file() for name in names) and (folder / "data").is_dir():
         folder = folder / "data"
@@ -129,10 +150,10 @@ def _read_results(
     missing = [name for name, file in files.items() if not file.is_file()]
     if missing and not missing_as_empty:
         raise InputError(
-            f"{folder}: no result file for {len(missing)} of {len(names)} labelled sweeps, the first is "
+            f"{folder}: no result file for {len(missing)} of {len(names)} labelled {what}, the first is "
             f"{missing[0]}.txt. Detect in them too, or take missing files for empty ones."
         )
-    return {name: None if name in missing else _read_scored(file) for name, file in files.items()}
+    return {name: None if name in missing else file for name, file in files.items()}
 
 
 def _read_scored(file: pathlib.Path) -> list[KittiObject]:

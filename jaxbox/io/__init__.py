@@ -22,6 +22,14 @@ from jaxbox.io.kitti import (
     write_labels,
 )
 from jaxbox.io.kitti_calibration import read_calibration, read_raw_calibration, write_calibration
+from jaxbox.io.kitti_tracking import (
+    objects_by_frame,
+    objects_from_tracks,
+    read_track_detections,
+    read_track_folder,
+    read_tracks,
+    write_tracks,
+)
 from jaxbox.io.labelled import LabelledBoxes
 from jaxbox.io.las import read_las
 from jaxbox.io.levelled import LevelSweeps, measure_sweeps
@@ -54,8 +62,10 @@ __all__ = [
     "boxes_from_objects",
     "detections_record",
     "measure_sweeps",
+    "objects_by_frame",
     "objects_from_boxes",
     "objects_from_detections",
+    "objects_from_tracks",
     "open_sweeps",
     "read_argoverse2_boxes",
     "read_argoverse2_ground",
@@ -82,10 +92,14 @@ __all__ = [
     "read_semantic_labels",
     "read_text_points",
     "read_timed_points",
+    "read_track_detections",
+    "read_track_folder",
+    "read_tracks",
     "remove_abandoned",
     "write_bin",
     "write_calibration",
     "write_config",
     "write_jsonl",
     "write_labels",
+    "write_tracks",
 ]

@@ -12,7 +12,7 @@ import dataclasses
 import math
 import os
 import pathlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 import jax
 import numpy as np
@@ -35,6 +35,9 @@ VEHICLE_TYPES = tuple(label.word.capitalize() for label in Label)
 
 MIN_VISIBLE_FRACTION = 0.3
 """Boxes with less of their 2D box in the image are not answers: the labels hold what the image shows."""
+
+# Boxes go to the image so many at a time, the last ones padded, so that one number of them is compiled.
+_CHUNK = 256
 
 _project_boxes = jax.jit(project_boxes)
 
@@ -90,18 +93,34 @@ def read_labels(path: str | os.PathLike[str], *, frame: int | None = None) -> li
       InputError: naming file, line and field, for a wrong number of columns or a field that is no
         finite number.
     """
+    return [item for _, item in numbered_labels(path, frame=frame)]
+
+
+def numbered_labels(
+    path: str | os.PathLike[str], *, frame: int | None = None
+) -> Iterator[tuple[int, KittiObject]]:
+    """Reads a label or result file, with the number of each object's line, which errors name.
+
+    Args:
+      path: the file.
+      frame: keep only this frame of a tracking file; None keeps every line.
+
+    Yields:
+      Line, from 1, and object, in the file's order.
+
+    Raises:
+      InputError: as `read_labels`.
+    """
     rows = ((number, line.split()) for number, line in enumerate(read_text(path).splitlines(), start=1))
-    return [
-        _parse_object(fields, f"{path}, line {number}")
-        for number, fields in rows
-        if fields and (frame is None or fields[0] == str(frame))
-    ]
+    for number, fields in rows:
+        if fields and (frame is None or fields[0] == str(frame)):
+            yield number, _parse_object(fields, f"{path}, line {number}")
 
 
 def _parse_object(fields: list[str], where: str) -> KittiObject:
     frame = track_id = None
     if len(fields) in _TRACKING_COLUMNS:
-        frame, track_id = _integer(fields[0], "frame", where), _integer(fields[1], "track id", where)
+        frame, track_id = whole_number(fields[0], "frame", where), whole_number(fields[1], "track id", where)
         fields = fields[2:]
     elif len(fields) not in _OBJECT_COLUMNS:
         raise InputError(
@@ -126,7 +145,20 @@ def _parse_object(fields: list[str], where: str) -> KittiObject:
     )
 
 
-def _integer(text: str, name: str, where: str) -> int:
+def whole_number(text: str, name: str, where: str) -> int:
+    """Reads a whole number.
+
+    Args:
+      text: of one field.
+      name: of the field, for the message.
+      where: file and line, for the message.
+
+    Returns:
+      The number.
+
+    Raises:
+      InputError: where it is none.
+    """
     try:
         return int(text)
     except ValueError as error:
@@ -270,9 +302,8 @@ def objects_from_boxes(
     Returns:
       n objects, with the part out of the image as truncation and occlusion 0; None for no label.
     """
-    image = _project_boxes(center, size, yaw, calibration)
-    fraction, boxes_px = np.asarray(image.visible_fraction), np.asarray(image.boxes_px, np.float64)
-    keep = np.asarray(image.visible) & (fraction >= min_visible_fraction)
+    boxes_px, fraction, visible = boxes_in_image(center, size, yaw, calibration)
+    keep = visible & (fraction >= min_visible_fraction)
     location, rotation_y = _kitti_pose(center, size, yaw, calibration)
     length, width, height = np.asarray(size, np.float64).T
     return [
@@ -292,6 +323,33 @@ def objects_from_boxes(
         else None
         for row in range(len(types))
     ]
+
+
+def boxes_in_image(
+    center: np.ndarray, size: np.ndarray, yaw: np.ndarray, calibration: Calibration
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Projects any number of boxes into the image, without compiling for each number of them.
+
+    Args:
+      center: (n, 3) m, sensor frame.
+      size: (n, 3) m: length, width, height.
+      yaw: (n,) rad.
+      calibration: the camera.
+
+    Returns:
+      boxes_px: (n, 4) float64, px: left, top, right, bottom, clipped to the image; 0 where not visible.
+      visible_fraction: (n,) float32, in [0, 1]: part of the 2D box that is in the image.
+      visible: (n,) bool: some of the box is before the camera and in the image.
+    """
+    num = len(center)
+    padded = np.zeros((-(-num // _CHUNK) * _CHUNK, 7), np.float32)
+    padded[:num] = np.column_stack([center, size, yaw])
+    parts = [(np.zeros((0, 4)), np.zeros(0, np.float32), np.zeros(0, bool))]
+    for chunk in padded.reshape(-1, _CHUNK, 7):
+        image = _project_boxes(chunk[:, :3], chunk[:, 3:6], chunk[:, 6], calibration)
+        parts.append((np.asarray(image.boxes_px, float), image.visible_fraction, image.visible))
+    boxes_px, fraction, visible = (np.concatenate(column)[:num] for column in zip(*parts, strict=True))
+    return boxes_px, fraction, visible
 
 
 def _kitti_pose(
@@ -314,18 +372,19 @@ def _ground_axes(T_rect_velo: np.ndarray) -> np.ndarray:
 
 
 def boxes_from_objects(
-    objects: Sequence[KittiObject], calibration: Calibration
+    objects: Sequence[KittiObject], calibration: Calibration, *, keep_heading: bool = False
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Boxes of KITTI objects in the LiDAR frame: the inverse of `objects_from_detections`.
 
     Args:
       objects: n objects with a 3D box.
       calibration: of their sweep.
+      keep_heading: whether yaw points to the object's front, and length and width stay as they are.
 
     Returns:
       center: (n, 3) float64, m, sensor frame, the box's centre.
       size: (n, 3) float64, m: length >= width, height; a pedestrian's may have to change places.
-      yaw: (n,) float64, rad, in [-pi/2, pi/2).
+      yaw: (n,) float64, rad, in [-pi/2, pi/2), or in [-pi, pi] for headings.
 
     Raises:
       ValueError: where one is a DontCare region, which has no 3D box.
@@ -339,6 +398,8 @@ def boxes_from_objects(
     center = np.linalg.solve(T_rect_velo[:3, :3], (center - T_rect_velo[:3, 3]).T).T
     rotation_y = np.array([item.rotation_y for item in objects])
     x, y = np.linalg.solve(_ground_axes(T_rect_velo), np.stack([np.cos(rotation_y), -np.sin(rotation_y)]))
+    if keep_heading:
+        return center, size, np.arctan2(y, x)
     across = size[:, 1] > size[:, 0]
     size[across, :2] = size[across, 1::-1]
     return center, size, _wrap_yaw(np.arctan2(y, x) + across * np.pi / 2)

@@ -1,0 +1,104 @@
+"""Options of ``jaxbox eval``, of single sweeps and of tracks."""
+
+import pathlib
+from typing import Annotated
+
+import typer
+
+from jaxbox.cli.console import input_errors, stdout
+from jaxbox.cli.evaluate import run_eval
+from jaxbox.cli.evaluate_tracking import run_eval_tracking
+from jaxbox.cli.report import SHOWN_MIN_SCORE
+
+DrivesOption = Annotated[
+    pathlib.Path | None, typer.Option(help='Text file of the drive of each frame: "frame drive" a line.')
+]
+
+
+def evaluate(
+    *,
+    labels: Annotated[pathlib.Path, typer.Option(help="The KITTI folder that was given to `detect`.")],
+    results: Annotated[pathlib.Path, typer.Option(help="The folder that `detect` wrote to.")],
+    json: Annotated[pathlib.Path | None, typer.Option(help="Also write every figure to this file.")] = None,
+    plots: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="Folder for the plots (the plots extra); RESULTS/plots unless given."),
+    ] = None,
+    pictures: Annotated[
+        bool, typer.Option("--pictures", help="Draw what was found, missed and false: RESULTS/pictures.")
+    ] = False,
+    min_score: Annotated[
+        float | None,
+        typer.Option(
+            help=f"Draw no lower scores, {SHOWN_MIN_SCORE:g} unless given; the figures take all. "
+            "With --tracking: leave lower scores out of the tracks' figures, none unless given.",
+        ),
+    ] = None,
+    drives: DrivesOption = None,
+    tracking: Annotated[
+        bool,
+        typer.Option(
+            "--tracking",
+            help="Results are tracks, one text file a sequence; LABELS holds label_02/ and calib/.",
+        ),
+    ] = False,
+    frames: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SEQUENCE[:FIRST-LAST]",
+            help="With --tracking: evaluate only this sequence and these frames, as 0000:0-47; repeatable.",
+        ),
+    ] = None,
+    missing_as_empty: Annotated[
+        bool, typer.Option("--missing-as-empty", help="Take a missing result file for one without boxes.")
+    ] = False,
+) -> None:
+    """Score results against labels: the paper's size errors, recall and precision, KITTI's AP.
+
+    Pictures are RESULTS/pictures/NAME_eval.png and contact_sheet.png, all frames on one.
+
+    With --tracking: HOTA, CLEAR and identity by KITTI's protocol, and of vehicles from above and in 3D.
+    """
+    _check_options(tracking=tracking, frames=frames, plots=plots, drives=drives, pictures=pictures)
+    if not tracking and min_score is not None and not 0 <= min_score <= 1:
+        raise typer.BadParameter(f"--min-score is {min_score:g}; scores of detections are from 0 to 1.")
+    with input_errors():
+        if tracking:
+            run_eval_tracking(
+                labels,
+                results,
+                frames=frames or (),
+                missing_as_empty=missing_as_empty,
+                min_score=min_score,
+                json_path=json,
+                console=stdout(),
+            )
+            return
+        run_eval(
+            labels,
+            results,
+            missing_as_empty=missing_as_empty,
+            json_path=json,
+            plots=plots,
+            drives_path=drives,
+            pictures=pictures,
+            min_score=SHOWN_MIN_SCORE if min_score is None else min_score,
+            console=stdout(),
+        )
+
+
+def _check_options(
+    *,
+    tracking: bool,
+    frames: list[str] | None,
+    plots: pathlib.Path | None,
+    drives: pathlib.Path | None,
+    pictures: bool,
+) -> None:
+    """Refuses options of the other kind of results, rather than passing them over."""
+    if frames and not tracking:
+        raise typer.BadParameter("--frames chooses frames of tracking sequences; give --tracking with it.")
+    of_sweeps = {"--plots": plots, "--drives": drives, "--pictures": pictures}
+    for name, value in of_sweeps.items():
+        if tracking and value:
+            raise typer.BadParameter(f"{name} is for single sweeps; leave it out with --tracking.")
