@@ -1,4 +1,3 @@
-<<<<<<< HEAD
 """Time: from the detections of successive sweeps to vehicles with an identity, a velocity and a state."""
 
 from jaxbox.config import TrackConfig
@@ -22,6 +21,3 @@ __all__ = [
     "track_sequence",
     "track_step",
 ]
-=======
-"""Time: where the sensor was at each sweep, and vehicles over the sweeps of a recording."""
->>>>>>> h4

@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from jaxbox.io._extras import require
+from jaxbox._extras import require
 
 EPSILON = float(np.finfo(float).eps)
 """Overlaps reach a limit that they miss by no more than this, as in the official evaluator."""
