@@ -301,10 +301,17 @@ def test_the_better_score_takes_the_object_and_the_other_is_false():
     assert (curve.num_boxes, curve.precision.tolist()) == (2, [1.0, 0.5])
 
 
-def test_what_overlaps_only_an_ignored_object_is_left_out():
+def test_one_box_of_an_ignored_object_is_left_out_and_a_second_is_wrong():
     truth = truth_of(vehicle(10), vehicle(20), counts=[True, False])
-    curve = curve_of(truth, found_of(vehicle(10), vehicle(20), vehicle(20.2), vehicle(50)))
+    curve = curve_of(truth, found_of(vehicle(10), vehicle(20), vehicle(50)))
     assert (curve.num_labels, curve.num_boxes, curve.max_recall) == (1, 2, 1.0)
+    curve = curve_of(truth, found_of(vehicle(10), vehicle(20), vehicle(20.2), vehicle(50)))
+    assert curve.num_boxes == 3
+
+
+def test_an_object_that_counts_goes_before_an_ignored_one_of_better_overlap():
+    truth = truth_of(vehicle(10), vehicle(10.8), counts=[True, False])
+    assert curve_of(truth, found_of(vehicle(10.6))).max_recall == 1
 
 
 def test_3d_overlap_looks_at_the_height():
@@ -442,6 +449,8 @@ def test_rows_that_do_not_belong_together_are_refused():
         found_of(vehicle(1), scores=[0.5, 0.5])
     with pytest.raises(ValueError, match="not finite"):
         found_of(vehicle(np.nan))
+    with pytest.raises(ValueError, match="a score is not finite"):
+        found_of(vehicle(1), scores=[np.nan])
     with pytest.raises(ValueError, match=r"must be \(n, 7\)"):
         FrameBoxes(np.zeros((1, 6)), np.zeros(1))
 
@@ -616,10 +625,13 @@ def test_options_that_cannot_be_used_end_with_exit_code_2(folder, options, messa
     assert message in " ".join(result.stderr.split())
 
 
-def test_frames_without_tracking_are_refused(tmp_path):
-    result = run("eval", "--labels", tmp_path, "--results", tmp_path, "--frames", "0000")
+@pytest.mark.parametrize(
+    ("options", "message"), [(("--frames", "0000"), "--tracking"), (("--min-score", "1.5"), "from 0 to 1")]
+)
+def test_options_of_tracks_are_refused_for_single_sweeps(tmp_path, options, message):
+    result = run("eval", "--labels", tmp_path, "--results", tmp_path, *options)
     assert result.exit_code == 2
-    assert "--tracking" in result.stderr
+    assert message in " ".join(result.stderr.split())
 
 
 def test_a_folder_without_labels_or_calibration_is_named(folder):

@@ -1,12 +1,12 @@
-"""CLEAR MOT: what is missed, false, and given to another identity than before.
+"""The CLEAR metrics: what is missed, false, and given to another identity than before.
 
     MOTA = 1 - (FN + FP + IDSW) / labels,  MOTP = mean overlap of the matches
 
 A label keeps the track that it had in the frame before where their overlap allows it; the others are
 matched by overlap. A switch is a label whose track is another one than at its last match, however long ago.
 
-Reference: Bernardin, Stiefelhagen, "Evaluating Multiple Object Tracking Performance: The CLEAR MOT
-Metrics", 2008; mostly tracked and lost: Li, Huang, Nevatia, CVPR 2009; the oracle is trackeval.
+Reference: Bernardin, Stiefelhagen, "Evaluating Multiple Object Tracking Performance",
+EURASIP 2008; mostly tracked and lost: Li, Huang, Nevatia, CVPR 2009; the oracle is trackeval.
 """
 
 import dataclasses

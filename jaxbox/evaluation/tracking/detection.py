@@ -1,7 +1,8 @@
 """Detection figures of the same boxes, so that single sweeps and tracks stand side by side.
 
-Boxes take objects in the order of their scores, over all frames: each the object of best overlap that is
-free. What overlaps only an object that does not count, or nothing where nobody labelled, is left out.
+Boxes take objects in the order of their scores: each the object of best overlap that is free, one that counts
+if there is any. A box of an object that does not count is left out, and so is one of no object where nobody
+labelled; a second box of the same object is wrong, as in KITTI's protocol.
 Precision and recall are those of all boxes from a score on, so boxes of one score come in together.
 """
 
@@ -119,15 +120,15 @@ def detection_curve(
 
 def _outcomes(frame: JudgedFrame, metric: str, min_overlap: float) -> np.ndarray:
     """(B,) whether each box is right, wrong or left out."""
-    overlap, counts = frame.overlaps[metric], np.asarray(frame.truth.counts, bool)
-    fits = overlap >= min_overlap - EPSILON
-    outcome = np.where(frame.excused | fits[~counts].any(axis=0), _LEFT_OUT, _WRONG)
-    open_overlap = np.where(fits & counts[:, None], overlap, 0)
+    counts = np.asarray(frame.truth.counts, bool)
+    free = np.where(frame.overlaps[metric] >= min_overlap - EPSILON, frame.overlaps[metric], 0)
+    outcome = np.where(frame.excused, _LEFT_OUT, _WRONG)
     # Most boxes of a frame overlap nothing; only the others take part.
-    near = np.flatnonzero(open_overlap.any(axis=0))
+    near = np.flatnonzero(free.any(axis=0))
     for box in near[np.argsort(-np.asarray(frame.found.scores)[near], kind="stable")]:
-        taken = int(np.argmax(open_overlap[:, box]))
-        if open_overlap[taken, box] > 0:
-            outcome[box] = _RIGHT
-            open_overlap[taken] = 0
+        # An object that counts goes before one that does not, whatever their overlaps.
+        taken = int(np.argmax(free[:, box] + (counts & (free[:, box] > 0))))
+        if free[taken, box] > 0:
+            outcome[box] = _RIGHT if counts[taken] else _LEFT_OUT
+            free[taken] = 0
     return outcome

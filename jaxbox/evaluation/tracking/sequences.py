@@ -143,6 +143,8 @@ def _check_rows(frame: FrameBoxes | FrameTruth, num: int) -> None:
         raise ValueError(f"boxes has shape {np.shape(frame.boxes)}; it must be (n, 7).")
     if not np.all(np.isfinite(frame.boxes)):
         raise ValueError("a box has a number that is not finite; leave out what has no box.")
+    if isinstance(frame, FrameBoxes) and not np.all(np.isfinite(frame.scores)):
+        raise ValueError("a score is not finite; every box needs one that can be compared.")
 
 
 def check_frames(truth: Mapping[str, TruthSequence], results: Mapping[str, Sequence[FrameBoxes]]) -> None:
