@@ -129,6 +129,15 @@ from jaxbox.reference.state import (
     ShapeDescriptors,
     Sweep,
 )
+from jaxbox.reference.tracking import (
+    track_step,
+)
+from jaxbox.reference.tracks import (
+    Track,
+    TrackedSweep,
+    TrackedVehicle,
+    Tracker,
+)
 
 __all__ = [
     "NO_CLUSTER",
@@ -151,6 +160,10 @@ __all__ = [
     "Rotations",
     "ShapeDescriptors",
     "Sweep",
+    "Track",
+    "TrackedSweep",
+    "TrackedVehicle",
+    "Tracker",
     "assemble",
     "assign_length_axis",
     "assign_points",
@@ -227,6 +240,7 @@ __all__ = [
     "spread_points",
     "surface_height",
     "top_of",
+    "track_step",
     "try_rotations",
     "weigh_boxes",
     "wrap_yaw",

@@ -4,6 +4,8 @@ A filter of the yaw would lock on to a reading that is a quarter turn off; votes
 means, but never shorter than what was seen.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
 
@@ -33,6 +35,8 @@ MAX_COURSE_SD = 0.15
 """The course is believed where the velocity's standard deviation is below this share of the speed."""
 FULL_FRONT_SPEED_MPS = 3.0
 """Speed from which a sweep's motion counts as one whole vote for the front."""
+MAX_TURN_RATE = math.pi / 2
+"""No vehicle turns faster, rad/s; a rate beyond it is of two sweeps with nearly the same time."""
 
 
 def doubled(yaw: jax.Array) -> jax.Array:
@@ -41,13 +45,16 @@ def doubled(yaw: jax.Array) -> jax.Array:
 
 
 def yaw_weight(seen: Observations) -> jax.Array:
-    """(D,) float32: what the yaw of each detection counts: its score times the root of its points."""
-    return seen.score * jnp.sqrt(jnp.minimum(seen.num_points.astype(jnp.float32), MAX_YAW_POINTS))
+    """(D,) float32: what the yaw of each detection counts: its score times the root of its points.
+
+    A detection whose points were not counted has one.
+    """
+    return seen.score * jnp.sqrt(jnp.clip(seen.num_points.astype(jnp.float32), 1, MAX_YAW_POINTS))
 
 
 def size_sums(seen: Observations, is_crossed: jax.Array) -> jax.Array:
     """(D, 4) float32: what each detection adds to `Slots.size_sum`."""
-    points = jnp.minimum(seen.num_points.astype(jnp.float32), MAX_SIZE_POINTS)
+    points = jnp.clip(seen.num_points.astype(jnp.float32), 0, MAX_SIZE_POINTS)
     weight = points * jnp.where(is_crossed, CROSSED_WEIGHT, 1.0) + CROSSED_WEIGHT
     return jnp.concatenate([seen.size * weight[:, None], weight[:, None]], axis=1)
 
@@ -80,7 +87,8 @@ def update_yaw(
     innovation = wrap_yaw(seen.yaw - slots.yaw)
     # A larger one is another face that was taken for the side, and no turn.
     correction = jnp.where(jnp.abs(innovation) < jnp.pi / 8, config.turn_gain * innovation / dt, 0.0)
-    turn_rate = jnp.where(moving, slots.turn_rate + correction, 0.0)
+    turn_rate = jnp.clip(slots.turn_rate + correction, -MAX_TURN_RATE, MAX_TURN_RATE)
+    turn_rate = jnp.where(moving, turn_rate, 0.0)
     vote = vote + yaw_weight(seen)[:, None] * doubled(seen.yaw)
     course = jnp.arctan2(slots.velocity[:, 1], slots.velocity[:, 0])
     course_weight = jnp.where(is_course_sure(slots, config), config.course_weight, 0.0)
@@ -185,7 +193,7 @@ def front_of(yaw: jax.Array, front_vote: jax.Array) -> tuple[jax.Array, jax.Arra
     """Where the front of a box points, and how sure that is.
 
     Args:
-      yaw: (T,) float32, rad, of the length axis.
+      yaw: (T,) float32, rad, in [-pi/2, pi/2), of the length axis.
       front_vote: (T, 2) float32, in whole votes.
 
     Returns:
@@ -195,5 +203,6 @@ def front_of(yaw: jax.Array, front_vote: jax.Array) -> tuple[jax.Array, jax.Arra
     axis = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
     votes = jnp.sum(axis * front_vote, axis=-1)
     heading = jnp.where(votes >= 0, yaw, yaw + jnp.pi)
-    heading = heading - 2 * jnp.pi * jnp.floor(heading / (2 * jnp.pi) + 0.5)
+    # Compared and not divided, so that no rounding leaves the interval.
+    heading = jnp.where(heading >= jnp.pi, heading - 2 * jnp.pi, heading)
     return heading, jax.nn.sigmoid(jnp.abs(votes))

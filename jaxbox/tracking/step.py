@@ -43,7 +43,8 @@ def track_step(
 
     Returns:
       The state to go on with, and the T tracks of this sweep. Where the sweep is not later than the last one
-      the state is as it was, and no detection belongs to a track.
+      it is passed over: the state is as it was, nothing is counted, and no detection belongs to a track. Time
+      and pose of the next sweep are since the last one that was not passed over.
 
     Reference: oracle `jaxbox.reference.tracking.track_step`; Kalman (1960) with the constant-velocity model;
     two stages as ByteTrack (Zhang et al., 2022).
@@ -339,7 +340,7 @@ def _answer(
         confirmed=alive & (slots.hits >= config.confirm_hits),
         age=slots.age,
         hits=slots.hits,
-        sight=jnp.where(slots.misses == 0, Sight.SEEN.value, missed).astype(jnp.int32),
+        sight=jnp.where(is_seen, Sight.SEEN.value, missed).astype(jnp.int32),
         detection=jnp.where(is_seen, order[jnp.minimum(row, len(order) - 1)], FREE).astype(jnp.int32),
         motion=motions,
         lateral_shift_m=shift,

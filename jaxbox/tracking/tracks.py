@@ -66,7 +66,8 @@ _STATUS_TEXT = {
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class TrackCounts:
-    """True counts of one sweep. Every valid detection is in exactly one of the first six."""
+    """True counts of one sweep. Every valid detection is in exactly one of the first six, or in none where
+    the sweep was passed over (`TrackStatus.TIME_NOT_LATER`)."""
 
     matched: jax.Array
     """() int32: detections that belong to a track of the sweep before."""

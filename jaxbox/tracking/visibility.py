@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.config import TrackConfig
-from jaxbox.geometry.planar import rectangle_corners
+from jaxbox.geometry.planar import rectangle_corners, rotate
 
 NUM_RAYS = 24
 """Azimuths over a box at which the nearest return is looked up."""
@@ -35,6 +35,8 @@ def is_hidden(
     share = jnp.linspace(0.0, 1.0, NUM_RAYS, dtype=jnp.float32)
     azimuth = middle[:, None] + low[:, None] + (high - low)[:, None] * share
     cell = jnp.floor((azimuth / TURN + 0.5) * num_azimuths).astype(jnp.int32) % num_azimuths
-    nearest = jnp.min(jnp.linalg.norm(corners, axis=-1), axis=1)
+    # Of the whole outline: a long vehicle abreast of the sensor is much nearer than its corners.
+    outside = jnp.maximum(jnp.abs(rotate(-center, -yaw)) - size / 2, 0)
+    nearest = jnp.linalg.norm(outside, axis=1)
     is_before = first_return_m[cell] < nearest[:, None] - config.hidden_gap_m
     return jnp.mean(is_before.astype(jnp.float32), axis=1) > config.hidden_share
