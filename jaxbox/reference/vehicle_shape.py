@@ -15,6 +15,8 @@ CROSSED_WEIGHT = 1e-3
 """Weight of the size of a detection whose length lies across the track's, and of one without points."""
 SEEN_QUANTILE, SEEN_STEP_M, SEEN_MIN_STEP_M = 0.9, 0.5, 0.05
 """Quantile of the seen extents, and the first and the least step of the search for it, m."""
+SEEN_SHARE = 0.8
+"""A side of which a sweep saw more than this share of the track's is as long as that sweep says."""
 MAX_COURSE_SD = 0.15
 """The course is believed where the velocity's standard deviation is below this share of the speed."""
 FULL_FRONT_SPEED_MPS = 3.0
@@ -257,7 +259,7 @@ def keep_visible_faces(center: np.ndarray, size: np.ndarray, yaw: float, new_siz
 
 
 def refine_box(track: Track, seen: Any, row: int) -> Box:
-    """The box of a detection, with the length and the yaw that the track knows.
+    """The box of a detection, with the yaw that the track knows, and its length unless most of it was seen.
 
     Args:
       track: updated.
@@ -271,7 +273,9 @@ def refine_box(track: Track, seen: Any, row: int) -> Box:
     yaw = float(seen.yaw[row])
     if track.hits <= MATURE_HITS:
         return Box(center, size, wrap_yaw(yaw))
-    flat = size[1::-1] if is_crossed(yaw, track.yaw) else size[:2]
-    new = np.array([track.size()[0], flat[1]])
+    crossed, length = is_crossed(yaw, track.yaw), track.size()[0]
+    flat = size[1::-1] if crossed else size[:2]
+    seen_whole = not crossed and seen.extent[row][0] > SEEN_SHARE * length
+    new = np.array([flat[0] if seen_whole else length, flat[1]])
     place = keep_visible_faces(center[:2], flat, track.yaw, new)
     return Box(np.array([*place, center[2]]), np.array([*new, size[2]]), wrap_yaw(track.yaw))
