@@ -8,7 +8,17 @@ from jaxbox.run.cache import enable_cache
 from jaxbox.run.compiled import detect
 from jaxbox.run.streaming import StreamedSweep, stream
 from jaxbox.run.summary import Summary, summarise
-from jaxbox.types import Calibration, Detections, GroundPlane, Hulls, Label, PointCloud, Status, stack_clouds
+from jaxbox.types import (
+    Calibration,
+    Detections,
+    GroundPlane,
+    Hulls,
+    Label,
+    Motion,
+    PointCloud,
+    Status,
+    stack_clouds,
+)
 
 __all__ = [
     "DEFAULT_SCORE_THRESHOLD",
@@ -18,6 +28,7 @@ __all__ = [
     "GroundPlane",
     "Hulls",
     "Label",
+    "Motion",
     "PointCloud",
     "Status",
     "StreamedSweep",

@@ -73,6 +73,17 @@ _STATUS_TEXT = {
 } | {bit: "; or ".join(row.overflow for row in rows) + "." for bit, rows in _OVERFLOW_ROWS.items()}
 
 
+class Motion(enum.IntEnum):
+    """What a vehicle does: it stands, starts, moves, stops, turns or changes lane."""
+
+    STANDING = 0
+    STARTING = 1
+    MOVING = 2
+    STOPPING = 3
+    TURNING = 4
+    LANE_CHANGE = 5
+
+
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class PointCloud:
