@@ -25,8 +25,15 @@ class Hits:
     """(n, 3) float64, unit: outward."""
     thing: np.ndarray
     """(n,) int64: row in `Scene.things`, -1 for the ground."""
-    visible: np.ndarray
-    """(V,) float64: of the rays that meet each vehicle if it is alone, the share that still do."""
+    met: np.ndarray
+    """(V,) int64: rays that meet each vehicle if it is alone."""
+    seen: np.ndarray
+    """(V,) int64: rays of those that still do."""
+
+    @property
+    def visible(self) -> np.ndarray:
+        """(V,) float64: of the rays that meet each vehicle if it is alone, the share that still do."""
+        return self.seen / np.maximum(self.met, 1)
 
 
 def cast(scene: Scene, origin: np.ndarray, directions: np.ndarray, draw: np.ndarray) -> Hits:
@@ -58,7 +65,7 @@ def cast(scene: Scene, origin: np.ndarray, directions: np.ndarray, draw: np.ndar
         material[rays], normal[rays] = thing_material[nearer], thing_normal[nearer]
     ids = np.array([thing.object_id for thing in things] + [Clutter.GROUND])
     seen = np.bincount(row[row >= 0], minlength=len(things))[: len(met)]
-    return Hits(distance, ids[row], material, normal, row, seen / np.maximum(met, 1))
+    return Hits(distance, ids[row], material, normal, row, met, seen)
 
 
 def ground_material(terrain: Terrain, points: np.ndarray) -> np.ndarray:

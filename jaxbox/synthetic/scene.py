@@ -3,6 +3,7 @@
 import dataclasses
 import enum
 import math
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -174,8 +175,8 @@ def make_scene(
         rng, ground=ground, slope_deg=slope_deg, slope_azimuth_deg=slope_azimuth_deg, kerb=kerb, road=road
     )
     vehicles = _draw_vehicles(rng, road, num_vehicles)
-    things = _draw_clutter(rng, terrain, vehicles) if clutter else ()
-    return Scene(terrain, vehicles, things)
+    things = draw_clutter(rng, terrain, [outline(vehicle) for vehicle in vehicles]) if clutter else []
+    return Scene(terrain, vehicles, tuple(thing for thing, _ in things))
 
 
 def _draw_vehicles(rng: np.random.Generator, road: Road, count: int) -> tuple[Vehicle, ...]:
@@ -199,7 +200,7 @@ def _has_room(vehicle: Vehicle, others: list[Vehicle], *, may_hide: bool) -> boo
         return False
     reach = math.hypot(*vehicle.size[:2]) / 2 + SPACING_M
     close = [o for o in others if math.dist(o.xy, vehicle.xy) < reach + math.hypot(*o.size[:2]) / 2]
-    if not all(_apart(outline(vehicle), outline(other)) for other in close):
+    if not all(are_apart(outline(vehicle), outline(other)) for other in close):
         return False
     return may_hide or not any(_hides(vehicle, other) or _hides(other, vehicle) for other in others)
 
@@ -226,10 +227,15 @@ def _draw_vehicle(rng: np.random.Generator, road: Road) -> Vehicle:
     )
     wobble = np.radians(rng.normal(0, HEADING_SD_DEG[place]))
     x, y = road.to_xy(np.array(along), np.array(across))
+    heading = float(road.heading + direction + wobble)
+    return Vehicle(label, (float(x), float(y)), heading, size, draw_paint(rng))
+
+
+def draw_paint(rng: np.random.Generator) -> tuple[float, float, float]:
+    """Linear RGB in [0, 1]: one of `PAINTS`, lighter or darker."""
     shade = rng.uniform(0.8, 1.2)
     red, green, blue = (min(channel * shade, 1.0) for channel in PAINTS[rng.integers(len(PAINTS))])
-    heading = float(road.heading + direction + wobble)
-    return Vehicle(label, (float(x), float(y)), heading, size, (red, green, blue))
+    return red, green, blue
 
 
 def draw_size(rng: np.random.Generator, label: Label) -> tuple[float, float, float]:
@@ -250,24 +256,29 @@ def draw_size(rng: np.random.Generator, label: Label) -> tuple[float, float, flo
 
 def outline(vehicle: Vehicle) -> np.ndarray:
     """(4, 2) corners in the bird's-eye view, m, counter-clockwise."""
-    return _rectangle(vehicle.xy, vehicle.size[0], vehicle.size[1], vehicle.heading)
+    return rectangle(vehicle.xy, vehicle.size[0], vehicle.size[1], vehicle.heading)
 
 
-def _rectangle(xy: tuple[float, float] | np.ndarray, length: float, width: float, yaw: float) -> np.ndarray:
+def rectangle(
+    xy: tuple[float, float] | np.ndarray, length: float, width: float, yaw: float | np.ndarray
+) -> np.ndarray:
+    """(..., 4, 2) corners, m, counter-clockwise from front left; xy is (..., 2), m, and yaw (...), rad."""
     signs = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / 2
     c, s = np.cos(yaw), np.sin(yaw)
-    return np.asarray(xy) + (signs * (length, width)) @ np.array([[c, s], [-s, c]])
+    turn = np.moveaxis(np.array([[c, s], [-s, c]]), (0, 1), (-2, -1))
+    return np.asarray(xy)[..., None, :] + (signs * (length, width)) @ turn
 
 
-def _apart(first: np.ndarray, second: np.ndarray) -> bool:
-    """Whether a line along an edge of either rectangle leaves `SPACING_M` between the two."""
+def are_apart(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(...) bool: whether a line along an edge of one of two rectangles (..., 4, 2) keeps them apart."""
+    apart = np.zeros((), bool)
     for corners in (first, second):
-        edges = corners[1:3] - corners[:2]
-        axes = edges / np.linalg.norm(edges, axis=1, keepdims=True)
-        p, q = first @ axes.T, second @ axes.T
-        if (np.maximum(p.min(0) - q.max(0), q.min(0) - p.max(0)) > SPACING_M).any():
-            return True
-    return False
+        edges = corners[..., 1:3, :] - corners[..., :2, :]
+        axes = edges / np.linalg.norm(edges, axis=-1, keepdims=True)
+        p, q = first @ axes.swapaxes(-1, -2), second @ axes.swapaxes(-1, -2)
+        gap = np.maximum(p.min(-2) - q.max(-2), q.min(-2) - p.max(-2))
+        apart = apart | (gap > SPACING_M).any(-1)
+    return apart
 
 
 def _hides(near: Vehicle, far: Vehicle) -> bool:
@@ -279,30 +290,43 @@ def _hides(near: Vehicle, far: Vehicle) -> bool:
     return bool(bearing.min() < 0 < bearing.max() and np.ptp(bearing) < np.pi)
 
 
-def _draw_clutter(
-    rng: np.random.Generator, terrain: Terrain, vehicles: tuple[Vehicle, ...]
-) -> tuple[Thing, ...]:
-    """Rows of clutter on both sides of the road, left out where a vehicle stands."""
-    taken = [outline(vehicle) for vehicle in vehicles]
-    things: list[Thing] = []
+def draw_clutter(
+    rng: np.random.Generator,
+    terrain: Terrain,
+    taken: Sequence[np.ndarray],
+    *,
+    rows: "Sequence[ClutterRow] | None" = None,
+    reach_m: tuple[float, float] = (-50.0, 85.0),
+) -> list[tuple[Thing, np.ndarray]]:
+    """Rows of clutter on both sides of the road, left out where something stands.
+
+    Args:
+      rng: draws them.
+      terrain: its road is what they line.
+      taken: outlines (4, 2), m, that they keep away from.
+      rows: what stands how far from the kerb; None for a street's.
+      reach_m: along the road, from where to where.
+
+    Returns:
+      The things, each with its footprint (4, 2), m.
+    """
+    outlines = np.reshape(taken, (-1, 4, 2))
+    things: list[tuple[Thing, np.ndarray]] = []
     for side in (-1, 1):
-        for draw, start, step in (
-            (_building, 13, (10, 20)),
-            (_garden, 8.5, (4, 11)),
-            (_kerbside, 6.4, (9, 22)),
-        ):
-            along = -50 + rng.uniform(0, 10)
-            while along < 85:
+        for draw, beyond, step in STREET_ROWS if rows is None else rows:
+            along = reach_m[0] + rng.uniform(0, 10)
+            while along < reach_m[1]:
                 length = float(rng.uniform(*step))
-                middle, across = along + length / 2, side * (start + rng.uniform(0, 1))
+                middle = along + length / 2
+                across = side * (terrain.road.half_width_m + beyond + rng.uniform(0, 1))
                 thing, footprint = draw(rng, terrain, middle, across, length)
-                if all(_apart(footprint, other) for other in taken):
-                    things.append(thing)
+                if are_apart(footprint, outlines).all():
+                    things.append((thing, footprint))
                 along += length
-    return tuple(things)
+    return things
 
 
-def _wall(rng: np.random.Generator, terrain: Terrain, footprint: np.ndarray, height_m: float) -> Thing:
+def make_wall(rng: np.random.Generator, terrain: Terrain, footprint: np.ndarray, height_m: float) -> Thing:
     """An upright block; it goes down far enough to meet any ground."""
     x, y = footprint.mean(0)
     edge, side = footprint[0] - footprint[1], footprint[1] - footprint[2]
@@ -320,25 +344,26 @@ def _wall(rng: np.random.Generator, terrain: Terrain, footprint: np.ndarray, hei
     )
 
 
-def _building(
+def draw_building(
     rng: np.random.Generator, terrain: Terrain, along: float, across: float, length: float
 ) -> tuple[Thing, np.ndarray]:
+    """A block of flats or houses."""
     depth = rng.uniform(6, 9)
     across = across + np.sign(across) * (depth / 2 + rng.choice((0.0, 0.0, 3.0)))
     xy = terrain.road.to_xy(np.array(along), np.array(across))
-    footprint = _rectangle(xy, length - rng.choice((0.0, 2.0, 5.0)), depth, terrain.road.heading)
-    return _wall(rng, terrain, footprint, rng.uniform(4, 10)), footprint
+    footprint = rectangle(xy, length - rng.choice((0.0, 2.0, 5.0)), depth, terrain.road.heading)
+    return make_wall(rng, terrain, footprint, rng.uniform(4, 10)), footprint
 
 
-def _garden(
+def draw_garden(
     rng: np.random.Generator, terrain: Terrain, along: float, across: float, length: float
 ) -> tuple[Thing, np.ndarray]:
     """A low wall, a hedge or a group of bushes."""
     xy = terrain.road.to_xy(np.array(along), np.array(across))
     if rng.random() < 0.35:
-        footprint = _rectangle(xy, length - 0.5, 0.3, terrain.road.heading)
-        return _wall(rng, terrain, footprint, rng.uniform(0.7, 1.8)), footprint
-    footprint = _rectangle(xy, length - 0.5, 1.8, terrain.road.heading)
+        footprint = rectangle(xy, length - 0.5, 0.3, terrain.road.heading)
+        return make_wall(rng, terrain, footprint, rng.uniform(0.7, 1.8)), footprint
+    footprint = rectangle(xy, length - 0.5, 1.8, terrain.road.heading)
     share = rng.choice((0.4, 1.0))
     blobs = tuple(
         _blob(rng, terrain, along + share * rng.uniform(-0.4, 0.4) * length, across + rng.normal(0, 0.3))
@@ -353,13 +378,13 @@ def _blob(rng: np.random.Generator, terrain: Terrain, along: float, across: floa
     return Foliage(np.array([x, y, terrain.height(x, y) + rng.uniform(0.2, 0.7)]), radii)
 
 
-def _kerbside(
+def draw_kerbside(
     rng: np.random.Generator, terrain: Terrain, along: float, across: float, length: float
 ) -> tuple[Thing, np.ndarray]:
     """A pole, or a tree: a trunk with a crown."""
     x, y = terrain.road.to_xy(np.array(along), np.array(across))
     foot = np.array([x, y, terrain.height(x, y) - 0.3])
-    footprint = _rectangle((float(x), float(y)), 0.5, 0.5, 0.0)
+    footprint = rectangle((float(x), float(y)), 0.5, 0.5, 0.0)
     if rng.random() < 0.5:
         return Thing(
             int(Clutter.POLE), (make_post(foot, rng.uniform(0.06, 0.12), rng.uniform(3, 7)),)
@@ -369,3 +394,18 @@ def _kerbside(
         Foliage(foot + rng.normal((0, 0, 4.6), (0.6, 0.6, 0.4)), rng.uniform(0.8, 1.5, 3)) for _ in range(7)
     )
     return Thing(int(Clutter.BUSH), (trunk, *crown)), footprint
+
+
+ClutterRow = tuple[
+    Callable[[np.random.Generator, Terrain, float, float, float], tuple[Thing, np.ndarray]],
+    float,
+    tuple[float, float],
+]
+"""What draws a thing and its footprint, how far from the kerb, m, and the least and greatest length, m."""
+
+STREET_ROWS: tuple[ClutterRow, ...] = (
+    (draw_building, 7.3, (10.0, 20.0)),
+    (draw_garden, 2.8, (4.0, 11.0)),
+    (draw_kerbside, 0.7, (9.0, 22.0)),
+)
+"""Houses, gardens before them, and what stands at the kerb."""

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from jaxbox.synthetic.camera import make_calibration, render_image
-from jaxbox.synthetic.raycast import cast
+from jaxbox.synthetic.raycast import Hits, cast
 from jaxbox.synthetic.scene import Clutter, Scene, Thing, make_scene, vehicle_pose
 from jaxbox.synthetic.solids import GLASS_REFLECTED, Material, make_solid
 from jaxbox.synthetic.terrain import MAX_RANGE_M, GroundKind, make_terrain
@@ -165,22 +165,20 @@ def scan(
     Raises:
       ValueError: for counts below 1, negative noise or a dropout outside [0, 1].
     """
-    _check_sensor(num_beams, num_azimuths, range_noise_m, dropout)
+    check_sensor(num_beams, num_azimuths, range_noise_m, dropout)
     rng = np.random.default_rng((seed, 1))
     directions = beam_directions(num_beams, num_azimuths)
     draw = rng.random(len(directions))
     hits = cast(scene, np.zeros(3), directions, draw)
-    reflectance = _reflectance(scene, hits.object_id, hits.material)
-    cosine = np.abs((hits.normal * directions).sum(axis=1))
-    returned = _returned(rng, hits.distance, reflectance * cosine, dropout)
-    returned &= (hits.material != Material.GLASS) | (draw < GLASS_REFLECTED)
-    noisy = hits.distance + rng.normal(0, range_noise_m, len(draw))
-    brightness = reflectance * (0.4 + 0.6 * cosine) + rng.normal(0, 0.03, len(draw))
+    echoes = echoes_of(scene, hits, directions)
+    returned, xyz, intensity = receive(
+        rng, directions, echoes, draw, range_noise_m=range_noise_m, dropout=dropout
+    )
     object_id = hits.object_id[returned]
     calibration = make_calibration()
     return SyntheticSweep(
-        xyz=(directions[returned] * noisy[returned, None]).astype(np.float32),
-        intensity=np.clip(brightness[returned], 0, 1).astype(np.float32),
+        xyz=xyz,
+        intensity=intensity,
         object_id=object_id,
         is_ground=object_id == Clutter.GROUND,
         boxes=_truth_boxes(scene, object_id, hits.visible),
@@ -190,7 +188,62 @@ def scan(
     )
 
 
-def _check_sensor(num_beams: int, num_azimuths: int, range_noise_m: float, dropout: float) -> None:
+@dataclasses.dataclass(frozen=True)
+class Echoes:
+    """What comes back to the sensor of n beams, before noise."""
+
+    distance: np.ndarray
+    """(n,) float64, m; infinite where a beam meets nothing."""
+    is_glass: np.ndarray
+    """(n,) bool: whether it meets glass."""
+    reflectance: np.ndarray
+    """(n,) float64, in [0, 1]."""
+    cosine: np.ndarray
+    """(n,) float64, in [0, 1]: of the angle between beam and normal."""
+
+
+def echoes_of(scene: Scene, hits: Hits, directions: np.ndarray) -> Echoes:
+    """What the surfaces that n beams (n, 3) meet send back."""
+    return Echoes(
+        distance=hits.distance,
+        is_glass=hits.material == Material.GLASS,
+        reflectance=_reflectance(scene, hits.object_id, hits.material),
+        cosine=np.abs((hits.normal * directions).sum(axis=1)),
+    )
+
+
+def receive(
+    rng: np.random.Generator,
+    directions: np.ndarray,
+    echoes: Echoes,
+    draw: np.ndarray,
+    *,
+    range_noise_m: float,
+    dropout: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The points that a sensor makes of the echoes of its beams.
+
+    Args:
+      rng: of the noise and the dropouts.
+      directions: (n, 3) unit, sensor frame.
+      echoes: of n beams.
+      draw: (n,) in [0, 1): fate of each beam on glass.
+      range_noise_m: standard deviation of the range, m.
+      dropout: share of returns lost at random.
+
+    Returns:
+      (n,) bool: which beams return; of those (m, 3) float32, m, sensor frame, and (m,) float32 intensity.
+    """
+    returned = _returned(rng, echoes.distance, echoes.reflectance * echoes.cosine, dropout)
+    returned &= ~echoes.is_glass | (draw < GLASS_REFLECTED)
+    noisy = echoes.distance + rng.normal(0, range_noise_m, len(draw))
+    brightness = echoes.reflectance * (0.4 + 0.6 * echoes.cosine) + rng.normal(0, 0.03, len(draw))
+    xyz = (directions[returned] * noisy[returned, None]).astype(np.float32)
+    return returned, xyz, np.clip(brightness[returned], 0, 1).astype(np.float32)
+
+
+def check_sensor(num_beams: int, num_azimuths: int, range_noise_m: float, dropout: float) -> None:
+    """Raises ValueError for counts below 1, negative noise or a dropout outside [0, 1]."""
     if num_beams < 1 or num_azimuths < 1:
         raise ValueError(
             f"num_beams is {num_beams} and num_azimuths {num_azimuths}; both must be at least 1."
