@@ -45,5 +45,7 @@ def associate(slots: Slots, seen: Observations, usable: jax.Array, config: Track
     variance = slots.covariance[:, None, 0] + variance[None]
     distance_sq = jnp.sum(gap**2, axis=-1) / variance
     allowed = slots.alive[:, None] & usable[None] & (distance_sq < config.gate)
-    cost = distance_sq + 2 * jnp.log(variance) + STAGE_COST * (seen.score < config.high_score)[None]
+    cost = (
+        distance_sq + 2 * jnp.log(variance) + jnp.where(seen.score < config.high_score, STAGE_COST, 0.0)[None]
+    )
     return assign_greedily(cost, allowed)

@@ -61,7 +61,7 @@ def remember(slots: Slots, moment_age_s: jax.Array, dt: jax.Array) -> tuple[Slot
         pushed = jnp.concatenate([newest[:, None], moments[:, :-1]], axis=1)
         return jnp.where(is_due, pushed, moments)
 
-    length = jnp.minimum(slots.path_length + is_due, NUM_MOMENTS)
+    length = jnp.minimum(slots.path_length + is_due.astype(jnp.int32), NUM_MOMENTS)
     pushed_age = jnp.concatenate([jnp.zeros(1, jnp.float32), age[:-1]])
     return dataclasses.replace(
         slots,
@@ -105,7 +105,7 @@ def _moment(moment_age_s: jax.Array, ago_s: float) -> tuple[jax.Array, jax.Array
 def _moved_since(slots: Slots, index: jax.Array) -> jax.Array:
     """(T,) bool: whether tracks have moved at all moments since one."""
     later = jnp.arange(NUM_MOMENTS) > index
-    return jnp.all(slots.path_moving | later, axis=1) & (slots.path_length > index)
+    return jnp.all(slots.path_moving | later[None], axis=1) & (slots.path_length > index)
 
 
 def _course(direction: jax.Array) -> jax.Array:
