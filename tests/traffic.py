@@ -79,7 +79,7 @@ def drive(start, yaw, speed, turn_rate, times, *, stops=False, lane_m=0.0):
     return np.stack([x, y, yaws, speeds], axis=1)
 
 
-def simulate(seed, num_sweeps=60, dt=0.1, num_cars=14, capacity=CAPACITY) -> Recording:
+def simulate(seed, num_sweeps=80, dt=0.1, num_cars=14, capacity=CAPACITY) -> Recording:
     """Cars that drive, turn, stop and stand, seen from a carrier that turns, with all that goes wrong.
 
     Noise, quarter turns of boxes, misses, false alarms, and a wall that hides some of them.

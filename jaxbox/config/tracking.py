@@ -55,7 +55,7 @@ class TrackConfig:
     turning_deg_per_s: Scalar = 10.0
     """Change of course over 1 s from which a vehicle turns, degrees a second."""
     lane_change_m: Scalar = 2.0
-    """Shift to the side over 5 s from which a vehicle changes lanes, m,"""
+    """Shift to the side over 5 s, of its course before as of that after, from which it changes lanes, m,"""
     lane_course_deg: Scalar = 8.0
     """where its course at both ends agrees within this."""
     max_gap_s: Scalar = 1.0

@@ -18,6 +18,8 @@ LANE_S, LANE_END_S, LANE_END_M = 5.0, 0.8, 2.0
 """A change of lanes is looked for in so long a path, whose ends are so long, and at least this far."""
 MATURE_HITS = 10
 """Detections after which a velocity is good enough to be compared with an earlier one."""
+FIRST_MOMENTS = 3
+"""The velocity at a path's first moments is compared with none."""
 SPEED_SDS = 3.0
 """A vehicle that moves is faster than so many standard deviations of its speed."""
 STARTING_SPEED_MPS, STOPPING_SPEED_MPS, TURNING_SPEED_MPS = 3.0, 4.0, 1.5
@@ -99,7 +101,7 @@ def compare_with_earlier(track: Track, tracker: Tracker, config: TrackConfig) ->
     """
     place, age = find_moment(tracker, MEMORY_S)
     known = abs(age - MEMORY_S) < AGE_TOLERANCE * MEMORY_S and track.hits > MATURE_HITS
-    if not known or len(track.path) <= place:
+    if not known or len(track.path) <= place + FIRST_MOMENTS:
         return Motion.MOVING
     earlier = track.path[place].velocity
     rate_deg = abs(math.degrees(angle_between(earlier, track.velocity))) / age
@@ -147,13 +149,12 @@ def lateral_shift(track: Track, tracker: Tracker, config: TrackConfig) -> float:
     before = track.path[first_end].position - track.path[first].position
     after = track.path[0].position - track.path[last_start].position
     way = track.path[0].position - track.path[first].position
-    change = angle_between(before, after)
-    course = math.atan2(before[1], before[0]) + change / 2
-    shift = float(np.array([-math.sin(course), math.cos(course)]) @ way)
+    shifts = [float(np.linalg.norm(way)) * math.sin(angle_between(end, way)) for end in (before, after)]
+    least = float(config.lane_change_m)
     is_lane_change = (
         all(moment.moving for moment in track.path[: first + 1])
         and min(np.linalg.norm(before), np.linalg.norm(after)) > LANE_END_M
-        and abs(math.degrees(change)) < float(config.lane_course_deg)
-        and abs(shift) > float(config.lane_change_m)
+        and abs(math.degrees(angle_between(before, after))) < float(config.lane_course_deg)
+        and (min(shifts) > least or max(shifts) < -least)
     )
-    return shift if is_lane_change else 0.0
+    return sum(shifts) / 2 if is_lane_change else 0.0

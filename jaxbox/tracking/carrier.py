@@ -104,11 +104,10 @@ def to_current_frame(slots: Slots, interval: Interval) -> Slots:
       The slots in the sensor frame of this sweep.
     """
     turn = -interval.turn
-    center = jnp.concatenate([slots.position, slots.z[:, None]], axis=1) - interval.translation
+    center = jnp.concatenate([slots.position, slots.z[:, None]], axis=1) - interval.translation[None]
     center = center @ interval.rotation
     # The path is flat: it is moved by what the sensor did in the plane.
-    shift = interval.translation[:2]
-    place = rotate(slots.path[..., :2] - shift, turn)
+    place = rotate(slots.path[..., :2] - interval.translation[None, None, :2], turn)
     return dataclasses.replace(
         slots,
         position=center[:, :2],

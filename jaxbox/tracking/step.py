@@ -50,7 +50,9 @@ def track_step(
     two stages as ByteTrack (Zhang et al., 2022).
     """
     config = TrackConfig() if config is None else config
+    config = jax.tree.map(lambda setting: jnp.asarray(setting, jnp.float32), config)
     interval = check_interval(jnp.asarray(dt, jnp.float32), T_previous_current, state.started, config)
+    seen = _with_rows(seen)
     order = jnp.argsort(-jnp.where(seen.valid, seen.score, -jnp.inf), stable=True)
     seen = _take(seen, order)
     slots = _end_all(state.slots, interval.restarts)
@@ -84,6 +86,14 @@ class Fates(NamedTuple):
     """Its score is too low to begin a track."""
     invalid: jax.Array
     """It has NaN or infinite numbers."""
+
+
+def _with_rows(seen: Observations) -> Observations:
+    """The detections, and where there is no row one that is not valid, as nothing is taken of no rows."""
+    if seen.valid.shape[0] > 0:
+        return seen
+    rows = jax.tree.map(lambda a: jnp.zeros((1, *a.shape[1:]), a.dtype), seen)
+    return dataclasses.replace(rows, first_return_m=seen.first_return_m)
 
 
 def _take(seen: Observations, order: jax.Array) -> Observations:
@@ -190,6 +200,11 @@ def _label_score(seen: Observations) -> jax.Array:
     return jax.nn.one_hot(seen.label, len(Label), dtype=jnp.float32) * seen.score[:, None]
 
 
+def _is_confirmed(slots: Slots, config: TrackConfig) -> jax.Array:
+    """(T,) bool: whether tracks were detected often enough."""
+    return slots.hits.astype(jnp.float32) >= config.confirm_hits
+
+
 def forget(slots: Slots, first_return_m: jax.Array, config: TrackConfig) -> Slots:
     """Ends tracks that miss their detections: soon where they would be visible, later where they are hidden.
 
@@ -204,9 +219,10 @@ def forget(slots: Slots, first_return_m: jax.Array, config: TrackConfig) -> Slot
     size = shape.track_size(slots)[:, :2]
     is_missed = slots.misses > 0
     hidden = is_hidden(slots.position, size, slots.yaw, first_return_m, config) & is_missed
-    num_hidden = slots.hidden + hidden
-    lives = (slots.misses - num_hidden <= config.max_misses) & (num_hidden <= config.max_hidden)
-    lives = ~is_missed | (lives & (slots.hits >= config.confirm_hits))
+    num_hidden = slots.hidden + hidden.astype(jnp.int32)
+    num_visible = (slots.misses - num_hidden).astype(jnp.float32)
+    lives = (num_visible <= config.max_misses) & (num_hidden.astype(jnp.float32) <= config.max_hidden)
+    lives = ~is_missed | (lives & _is_confirmed(slots, config))
     remembered = dataclasses.replace(slots, hidden=num_hidden, hidden_now=hidden)
     return _where(lives & slots.alive, remembered, empty_slots(slots.id.shape[0]))
 
@@ -327,7 +343,7 @@ def _answer(
     size, yaw = shape.track_size(slots), wrap_yaw(slots.yaw)
     own_center, own_size, own_yaw = shape.refine_boxes(slots, own)
     shown_yaw = jnp.where(is_seen, own_yaw, yaw)
-    mean_score = slots.score_sum / jnp.maximum(slots.hits, 1)
+    mean_score = slots.score_sum / jnp.maximum(slots.hits.astype(jnp.float32), 1)
     heading, front_probability = shape.front_of(shown_yaw, slots.front_vote)
     motions, shift = motion.classify(slots, state.moment_age_s, config)
     missed = jnp.where(slots.hidden_now, Sight.HIDDEN.value, Sight.COASTING.value)
@@ -337,7 +353,7 @@ def _answer(
     return Tracks(
         id=slots.id,
         valid=alive,
-        confirmed=alive & (slots.hits >= config.confirm_hits),
+        confirmed=alive & _is_confirmed(slots, config),
         age=slots.age,
         hits=slots.hits,
         sight=jnp.where(is_seen, Sight.SEEN.value, missed).astype(jnp.int32),

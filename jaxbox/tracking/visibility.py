@@ -33,7 +33,7 @@ def is_hidden(
     offset = offset - TURN * jnp.round(offset / TURN)
     low, high = jnp.min(offset, axis=1), jnp.max(offset, axis=1)
     share = jnp.linspace(0.0, 1.0, NUM_RAYS, dtype=jnp.float32)
-    azimuth = middle[:, None] + low[:, None] + (high - low)[:, None] * share
+    azimuth = middle[:, None] + low[:, None] + (high - low)[:, None] * share[None]
     cell = jnp.floor((azimuth / TURN + 0.5) * num_azimuths).astype(jnp.int32) % num_azimuths
     # Of the whole outline: a long vehicle abreast of the sensor is much nearer than its corners.
     outside = jnp.maximum(jnp.abs(rotate(-center, -yaw)) - size / 2, 0)
