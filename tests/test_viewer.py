@@ -19,11 +19,10 @@ from viewer_sweeps import write_kitti, write_three_streets
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from jaxbox import DetectorConfig, PointCloud, io
+from jaxbox import DetectorConfig, PointCloud, _extras, io
 from jaxbox.cli import view as view_command
 from jaxbox.config import propose_capacities
 from jaxbox.config.fields import check_traced
-from jaxbox import _extras
 from jaxbox.run import cache
 from jaxbox.run.compiled import count_compilations
 from jaxbox.types import Status

@@ -177,10 +177,11 @@ def _recorded(listed: _Listed, topic: str | None) -> Iterator[Poses | UnusableSo
         raise InputError(f"{path}: no odometry on {topic}; topics of nav_msgs/Odometry: {known}.")
     for times, by_stamp in listed.clocks:
         clock = "" if by_stamp else ", by the times of recording"
-        found = odometry_poses(recorded, times, listed.frame_id, by_stamp=by_stamp, topic=topic)
-        for item in found if recorded.odometry else ():
+        for item in odometry_poses(recorded, times, listed.frame_id, by_stamp=by_stamp, topic=topic):
             yield _named(item, PoseSource.ODOMETRY, times, path, clock)
-    for times, by_stamp in listed.clocks if recorded.transforms and topic is None else ():
+    if topic is not None:
+        raise InputError(f"{path}: odometry on {topic} does not cover the sweeps, or they have no times.")
+    for times, by_stamp in listed.clocks if recorded.transforms else ():
         clock = "" if by_stamp else ", by the times of recording"
         try:
             item = tf_poses(recorded, times, listed.frame_id, by_stamp=by_stamp)
@@ -253,8 +254,8 @@ def _lines(sweeps: Sequence[Sweep], count: int, path: pathlib.Path) -> np.ndarra
     known = [number for number in numbers if number is not None]
     if len(known) < len(numbers) or max(known) >= count:
         raise InputError(
-            f"{path}: {count} lines for {len(sweeps)} sweeps up to {sweeps[-1].name}; a line is needed for each, "
-            "or for each number that names one, from 0."
+            f"{path}: {count} lines for {len(sweeps)} sweeps up to {sweeps[-1].name}; a line is needed for "
+            "each, or for each number that names one, from 0."
         )
     return np.array(known)
 

@@ -8,6 +8,7 @@ References: REP 105 and the messages nav_msgs/Odometry, geometry_msgs/TransformS
 
 import collections
 import dataclasses
+import itertools
 import pathlib
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -137,8 +138,9 @@ class Transforms:
         chain, parent = [frame], self.parent(frame)
         while parent is not None:
             if parent in chain:
+                circle = " < ".join([*chain, parent])
                 raise InputError(
-                    f"{self._recorded.path}: frames {' < '.join([*chain, parent])} go round in a circle; correct its transforms."
+                    f"{self._recorded.path}: frames {circle} go round in a circle; correct the transforms."
                 )
             chain.append(parent)
             parent = self.parent(parent)
@@ -151,7 +153,7 @@ class Transforms:
           UnusableSource: where a transform does not cover the sweeps.
         """
         T = np.tile(np.eye(4), (len(self._times_ns), 1, 1))
-        for child, parent in zip(chain, chain[1:], strict=False):
+        for child, parent in itertools.pairwise(chain):
             T = self._step(child, parent) @ T
         return T
 
