@@ -27,8 +27,10 @@ from jaxbox.io import foxglove
 from jaxbox.io.jsonl import JSONL
 from jaxbox.io.mcap_results import MCAP_RESULTS
 from jaxbox.io.parquet import PARQUET
+from jaxbox.io.pose_track import UnusableSource
+from jaxbox.io.recorded_poses import collect_poses, odometry_poses, tf_poses
 from jaxbox.io.results import ResultFile, SweepResult
-from jaxbox.io.rosbag import MessageDecoder
+from jaxbox.io.rosbag import MessageDecoder, decode_message
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 STORES = {1: get_typestore(Stores.ROS1_NOETIC), 2: get_typestore(Stores.ROS2_HUMBLE)}
@@ -269,6 +271,92 @@ def read_message(path: pathlib.Path) -> None:
             check_points(*MessageDecoder(data, "here", is_ros1)())
 
 
+# --- poses ----------------------------------------------------------------------------------------
+
+POSE_MESSAGE_TYPES = {1: ("nav_msgs/msg/Odometry",), 2: ("nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage")}
+"""By the version of ROS whose definitions the library has."""
+
+
+def pose_messages() -> dict[str, bytes]:
+    """Odometry and transforms of ROS 2, and odometry of ROS 1."""
+    seeds = {}
+    for ros, names in POSE_MESSAGE_TYPES.items():
+        types, store = STORES[ros].types, STORES[ros]
+        vector, turn = types["geometry_msgs/msg/Vector3"](x=1, y=2, z=3), {"x": 0, "y": 0, "z": 0.6, "w": 0.8}
+        header = make_message(ros).header
+        twist = types["geometry_msgs/msg/Twist"](linear=vector, angular=vector)
+        quaternion = types["geometry_msgs/msg/Quaternion"](**turn)
+        place = types["geometry_msgs/msg/Point"](x=1, y=2, z=3)
+        pose = types["geometry_msgs/msg/Pose"](position=place, orientation=quaternion)
+        transform = types["geometry_msgs/msg/Transform"](translation=vector, rotation=quaternion)
+        spread = {"covariance": np.zeros(36)}
+        for name in names:
+            if name.endswith("Odometry"):
+                message = types[name](
+                    header=header,
+                    child_frame_id="base_link",
+                    pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, **spread),
+                    twist=types["geometry_msgs/msg/TwistWithCovariance"](twist=twist, **spread),
+                )
+            else:
+                stamped = types["geometry_msgs/msg/TransformStamped"]
+                item = stamped(header=header, child_frame_id="lidar", transform=transform)
+                message = types[name](transforms=[item])
+            data = (store.serialize_ros1 if ros == 1 else store.serialize_cdr)(message, name)
+            seeds[f"{name}{ros}"] = bytes(data)
+    return seeds
+
+
+def read_pose_message(path: pathlib.Path) -> None:
+    """The bytes as a message of every kind, and the sensor's pose by it."""
+    for name in POSE_MESSAGE_TYPES[2]:
+        for is_ros1 in (False, True):
+            with contextlib.suppress(io.InputError):
+                message = decode_message(path.read_bytes(), name, "here", is_ros1=is_ros1)
+                found = collect_poses([("/a", TIME_NS, message)], path)
+                times = np.array([TIME_NS])
+                list(odometry_poses(found, times, "lidar", by_stamp=False))
+                with contextlib.suppress(UnusableSource):
+                    tf_poses(found, times, "lidar", by_stamp=False)
+
+
+OXTS = f"49.01 8.42 112.8 0.02 0.001 -1.2 {'0 ' * 24}\n"
+POSE_FILES = {
+    "kitti": b"1 0 0 0 0 1 0 0 0 0 1 0\n0 -1 0 1 1 0 0 2 0 0 1 0\n",
+    "tum": b"# time x y z quaternion\n1700000000.1 1 2 3 0 0 0 1\n",
+    "matrix": b"1,0,0,1,0,1,0,2,0,0,1,3,0,0,0,1\n",
+}
+
+
+def write_nuscenes(folder: pathlib.Path) -> None:
+    """A sweep, and the tables but that of the poses."""
+    sweep = folder.parent / "samples" / "LIDAR_TOP" / "a__LIDAR_TOP__1.pcd.bin"
+    sweep.parent.mkdir(parents=True, exist_ok=True)
+    sweep.write_bytes(b"")
+    data = {
+        "ego_pose_token": "e",
+        "calibrated_sensor_token": "c",
+        "filename": f"samples/LIDAR_TOP/{sweep.name}",
+    }
+    (folder / "sample_data.json").write_text(json.dumps([data]))
+    (folder / "calibrated_sensor.json").write_bytes(nuscenes_poses("c"))
+
+
+def nuscenes_poses(token: str) -> bytes:
+    """A table of one pose."""
+    return json.dumps([{"token": token, "rotation": [1, 0, 0, 0.0], "translation": [1.0, 2, 3]}]).encode()
+
+
+def write_argoverse_poses(folder: pathlib.Path) -> None:
+    """Two poses of a log."""
+    names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+    columns = {
+        name: np.array([value, value]) for name, value in zip(names, (1.0, 0, 0, 0, 5, 6, 7), strict=True)
+    }
+    table = pa.table({"timestamp_ns": np.array([1, 2]), **columns})
+    feather.write_feather(table, folder / "a.feather", compression="uncompressed")
+
+
 # --- labels, calibrations and settings ------------------------------------------------------------
 
 
@@ -439,6 +527,21 @@ TARGETS: Mapping[str, Target] = {
     ),
     "drives": Target(
         "a.txt", lambda path: io.read_drives(path, ["1"]), lambda: {"drives": b"1 city # first\n2 road\n"}
+    ),
+    "pose_file": Target("a.txt", io.read_pose_file, lambda: POSE_FILES),
+    "oxts": Target("a.txt", io.read_oxts, lambda: {"oxts": (2 * OXTS).encode()}),
+    "pose_messages": Target("a.msg", read_pose_message, pose_messages),
+    "nuscenes_poses": Target(
+        "v1.0-mini/ego_pose.json",
+        lambda path: io.find_poses(io.open_sweeps(path.parents[1])),
+        lambda: {"ego_pose": nuscenes_poses("e")},
+        write_nuscenes,
+    ),
+    "argoverse2_poses": Target(
+        "city_SE3_egovehicle.feather",
+        lambda path: io.find_poses(io.open_sweeps(path.parent / "sensors" / "lidar" / "1.feather")),
+        lambda: written(write_argoverse_poses),
+        lambda folder: write_log(folder / "calibration"),
     ),
     "image": Target("a.png", io.read_image, lambda: written(write_image)),
     "config_toml": Target(

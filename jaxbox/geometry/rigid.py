@@ -193,3 +193,25 @@ def move_along(xyz: np.ndarray, T_start_end: np.ndarray, share: np.ndarray) -> n
     turned = points + sine * (points @ K.T) + versine * (points @ (K @ K).T)
     drift = s * rho + versine / angle * (K @ rho) + (s - sine / angle) * (K @ K @ rho)
     return turned + drift
+
+
+def partial_motion(T_start_end: np.ndarray, share: float) -> np.ndarray:
+    """A share of a motion at constant linear and angular velocity: exp(share log T_start_end).
+
+    Args:
+      T_start_end: (4, 4) float64.
+      share: any; negative ones go back.
+
+    Returns:
+      (4, 4) float64.
+
+    >>> T = np.diag([-1.0, -1.0, 1.0, 1.0])
+    >>> np.round(partial_motion(T, 0.5)[:2, :2], 6).tolist()
+    [[0.0, -1.0], [1.0, 0.0]]
+    """
+    corners = np.vstack([np.zeros(3), np.eye(3)])
+    origin, *axes = move_along(corners, T_start_end, np.full(len(corners), share))
+    T = np.eye(4)
+    T[:3, :3] = np.stack(axes, axis=1) - origin[:, None]
+    T[:3, 3] = origin
+    return T

@@ -30,6 +30,7 @@ from jaxbox.io.kitti_tracking import (
     read_tracks,
     write_tracks,
 )
+from jaxbox.io.kitti_poses import read_oxts, read_raw_oxts
 from jaxbox.io.labelled import LabelledBoxes
 from jaxbox.io.las import read_las
 from jaxbox.io.levelled import LevelSweeps, measure_sweeps
@@ -39,9 +40,12 @@ from jaxbox.io.pandaset import read_pandaset_boxes, read_pandaset_points
 from jaxbox.io.pcd import read_pcd
 from jaxbox.io.ply import read_ply
 from jaxbox.io.points import TimedPoints, read_bin, write_bin
+from jaxbox.io.pose_files import PoseFile, PoseFrame, read_pose_file
+from jaxbox.io.poses import find_poses
 from jaxbox.io.recordings import RecordedSweeps
 from jaxbox.io.registry import POINT_SUFFIXES, read_points, read_timed_points
 from jaxbox.io.semantic_kitti import read_semantic_labels
+from jaxbox.io.sequences import group_sequences
 from jaxbox.io.sweep import Sweep
 from jaxbox.io.sweeps import RECORDING_SUFFIXES, open_sweeps
 from jaxbox.io.text_points import read_text_points
@@ -54,6 +58,8 @@ __all__ = [
     "KittiObject",
     "LabelledBoxes",
     "LevelSweeps",
+    "PoseFile",
+    "PoseFrame",
     "RecordedSweeps",
     "Sweep",
     "TimedPoints",
@@ -61,6 +67,8 @@ __all__ = [
     "atomic_writer",
     "boxes_from_objects",
     "detections_record",
+    "find_poses",
+    "group_sequences",
     "measure_sweeps",
     "objects_by_frame",
     "objects_from_boxes",
@@ -83,12 +91,15 @@ __all__ = [
     "read_npy",
     "read_npz",
     "read_nuscenes",
+    "read_oxts",
     "read_pandaset_boxes",
     "read_pandaset_points",
     "read_pcd",
     "read_ply",
     "read_points",
+    "read_pose_file",
     "read_raw_calibration",
+    "read_raw_oxts",
     "read_semantic_labels",
     "read_text_points",
     "read_timed_points",

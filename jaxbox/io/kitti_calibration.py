@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxbox._files import InputError, atomic_writer, finite_number, read_text
 from jaxbox.geometry.projection import check_full_rank, compose_transforms, rigid_transform
+from jaxbox.tracking.poses import check_pose, orthonormal_pose
 from jaxbox.types import Calibration
 
 IMAGE_SIZE_PX = (1242, 375)
@@ -24,6 +25,7 @@ CAMERA = 2
 RAW_CALIBRATION_FILES = ("calib_velo_to_cam.txt", "calib_cam_to_cam.txt")
 """In a raw recording's folder of the day."""
 
+_ROTATION_VALUES = 9
 _MAX_VALUE = 1e9
 """Products of three values have to stay within float32's range."""
 
@@ -101,6 +103,51 @@ def read_raw_calibration(
         image_size_px = (int(width), int(height))
     extrinsics = np.hstack([rotation, translation])
     return _calibration(projection, rectification, extrinsics, image_size_px, folder)
+
+
+def read_transform(path: str | os.PathLike[str], *spellings: str) -> np.ndarray:
+    """Reads one rigid transform of a calibration file, in float64.
+
+    Args:
+      path: an object, tracking or odometry calibration, or ``calib_cam_to_cam.txt``.
+      spellings: of its key, such as Tr_velo_to_cam; nine numbers are a rotation.
+
+    Returns:
+      (4, 4) float64, m.
+
+    Raises:
+      InputError: naming file and key, where it is missing, or no rigid transform.
+    """
+    entries = _read_entries(path)
+    key = next((spelling for spelling in spellings if spelling in entries), "")
+    is_rotation = len(entries.get(key, ())) == _ROTATION_VALUES
+    matrix = _matrix(entries, spellings, (3, 3) if is_rotation else (3, 4), path)
+    return _rigid(matrix[:, :3], np.zeros(3) if is_rotation else matrix[:, 3], f"{path}, {key}")
+
+
+def read_raw_transform(path: str | os.PathLike[str]) -> np.ndarray:
+    """Reads ``calib_velo_to_cam.txt`` or ``calib_imu_to_velo.txt`` of a raw recording, in float64.
+
+    Args:
+      path: the file.
+
+    Returns:
+      (4, 4) float64, m: T_cam_velo or T_velo_imu.
+
+    Raises:
+      InputError: as `read_transform`.
+    """
+    entries = _read_entries(path)
+    R, t = _matrix(entries, ("R",), (3, 3), path), _matrix(entries, ("T",), (3,), path)
+    return _rigid(R, t, str(path))
+
+
+def _rigid(R: np.ndarray, t: np.ndarray, where: str) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    if problem := check_pose(T):
+        raise InputError(f"{where}: no rigid transform: {problem}. Give KITTI's calibration file.")
+    return orthonormal_pose(T)
 
 
 def _read_entries(path: str | os.PathLike[str]) -> dict[str, list[str]]:

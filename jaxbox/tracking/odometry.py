@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from jaxbox._extras import require
+from jaxbox.geometry.rigid import inverse_rigid, partial_motion
 from jaxbox.tracking.poses import Poses, PoseSource, check_pose, deskew
 from jaxbox.types import Detections
 
@@ -75,14 +76,16 @@ class KissIcp:
         Raises:
           ImportError: without the extra ``track``.
         """
-        library = require("kiss_icp.kiss_icp", extra="track", what="Poses from points")
+        self._library = require("kiss_icp.kiss_icp", extra="track", what="Poses from points")
         config = require("kiss_icp.config", extra="track", what="Poses from points").KISSConfig()
         # The library would deskew to the sweep's end; here poses are those of the sweep's own time.
         config.data.deskew = False
         config.data.max_range = max_range_m
         config.mapping.voxel_size = voxel_m
         config.registration.max_num_threads = num_threads
-        self._odometry = library.KissICP(config)
+        self._odometry = self._library.KissICP(config)
+        self._first: tuple[np.ndarray, np.ndarray] | None = None
+        self._num_sweeps = 0
         self.is_lost = False
         """Whether the last sweep could not be registered, so that its motion is that of the one before."""
 
@@ -101,9 +104,41 @@ class KissIcp:
           than `MIN_POINTS` points, and where the registration finds no pose, the motion before goes on, and
           `is_lost` is set.
         """
-        odometry = self._odometry
-        if time_s is not None:
-            xyz = deskew(xyz, time_s, odometry.last_delta)
+        pose = self._register(xyz, time_s)
+        self._num_sweeps += 1
+        if self._num_sweeps == 1 and time_s is not None:
+            self._first = np.array(xyz), np.array(time_s)
+        elif self._first is not None:
+            first, self._first = self._first, None
+            if not self.is_lost:
+                pose = self._restart(first, xyz, time_s)
+        return pose
+
+    def _restart(
+        self, first: tuple[np.ndarray, np.ndarray], xyz: np.ndarray, time_s: np.ndarray | None
+    ) -> np.ndarray:
+        """Registers the first two sweeps again once the motion between them is known.
+
+        The map would keep the distortion of the first one, to which no later sweep fits.
+        """
+        motion = self._odometry.last_delta
+        self._odometry = self._library.KissICP(self._odometry.config)
+        # So that the first sweep's time is the origin of the world.
+        middle = partial_motion(motion, _middle_share(first[1]))
+        self._odometry.last_pose, self._odometry.last_delta = middle @ inverse_rigid(motion), motion
+        self._register(*first)
+        return self._register(xyz, time_s)
+
+    def _register(self, xyz: np.ndarray, time_s: np.ndarray | None) -> np.ndarray:
+        """The pose at the sweep's time.
+
+        The library sees the sweep as from its middle. From its start, an error of the motion would shift the
+        points by half of it, and the next motion by as much: it would grow from sweep to sweep.
+        """
+        odometry, share = self._odometry, 0.0
+        if time_s is not None and np.isfinite(time_s).any():
+            share = _middle_share(time_s)
+            xyz = deskew(xyz, time_s - share * np.ptp(time_s[np.isfinite(time_s)]), odometry.last_delta)
         points = np.asarray(xyz, np.float64)
         points = points[np.isfinite(points).all(axis=1)]
         before, motion = odometry.last_pose, odometry.last_delta
@@ -111,9 +146,18 @@ class KissIcp:
         if not self.is_lost:
             odometry.register_frame(points, np.zeros(0))
             self.is_lost = check_pose(odometry.last_pose) is not None
+            if self.is_lost:
+                odometry.local_map.clear()
         if self.is_lost:
             odometry.last_pose, odometry.last_delta = before @ motion, motion
-        return np.array(odometry.last_pose)
+        return odometry.last_pose @ partial_motion(odometry.last_delta, -share)
+
+
+def _middle_share(time_s: np.ndarray) -> float:
+    """When the middle of a sweep is, from the sweep's time, as a share of its length; 0 without times."""
+    known = time_s[np.isfinite(time_s)]
+    span = float(np.ptp(known)) if known.size else 0.0
+    return float(known.min() + span / 2) / span if span else 0.0
 
 
 def kiss_icp_poses(sweeps: Iterable[TimedSweep], *, voxel_m: float = VOXEL_M, num_threads: int = 1) -> Poses:
