@@ -8,7 +8,6 @@ import functools
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 
 from jaxbox.config import DetectorConfig
 from jaxbox.stages import (
@@ -36,7 +35,7 @@ from jaxbox.stages.state import (
     Sweep,
 )
 from jaxbox.types import Detections, PointCloud
-from jaxbox.xla.barriers import materialize, outline
+from jaxbox.xla.barriers import opaque_zeros, outline
 
 
 class Segments(NamedTuple):
@@ -138,10 +137,9 @@ def complete_boxes(segments: Segments, config: DetectorConfig) -> Completed:
     """
     clusters, rotations, seen = segments.clusters, segments.rotations, segments.evidence
     cast = None if seen is None else functools.partial(evidence.cast_rays, seen, config=config.evidence)
-    preference = jnp.zeros(config.box.num_angles, jnp.float32)
+    preference = opaque_zeros(config.box.num_angles)
     if config.box.scene_direction and cast is not None:
-        none = materialize(preference)  # What is known to be zeros would have a program of its own.
-        unbiased = rectangles.choose_rectangles(rotations, clusters.num, none)
+        unbiased = rectangles.choose_rectangles(rotations, clusters.num, preference)
         preference = direction.scene_preference(unbiased, clusters, cast, config)
     candidates = rectangles.rectangle_candidates(rotations, clusters.num, preference, config)
     return completion.complete_boxes(candidates, segments.outlines.points, clusters, cast, config)

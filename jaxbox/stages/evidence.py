@@ -11,17 +11,8 @@ from jaxbox.config import EvidenceConfig
 from jaxbox.stages.state import Boxes, Evidence, FlatBoxes, Ground, RayFractions, Sweep
 from jaxbox.xla import chunks
 from jaxbox.xla.arithmetic import arctan2, cos_sin
-from jaxbox.xla.barriers import materialize
-from jaxbox.xla.loops import fast_axis, map_rows
-from jaxbox.xla.range_bits import (
-    BLOCK,
-    count_changes,
-    covered_words,
-    next_set,
-    next_words,
-    set_before,
-    words_at,
-)
+from jaxbox.xla.loops import apply_in_turn, fast_axis, map_rows
+from jaxbox.xla.range_bits import draw_beams, next_set, set_before, words_at
 from jaxbox.xla.rows import lookup
 
 SUPPORT_HALF_M = 100.0
@@ -94,17 +85,8 @@ def build_evidence(
     num_azimuths, num_ranges, range_cell_m = config.num_azimuths, config.num_ranges, config.range_cell_m
     rho = jnp.sqrt(xyz[:, 0] ** 2 + xyz[:, 1] ** 2)
     returned = mask & (rho >= config.min_range_m)
-    azimuth = materialize(azimuth_cell(arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths))
-    num_blocks = num_ranges // BLOCK + 1
-    size = num_blocks * BLOCK * num_azimuths
-
-    def place(valid: jax.Array, range_cell: jax.Array) -> jax.Array:
-        return jnp.where(valid, range_cell * num_azimuths + azimuth, size)
-
     is_hit = returned & (config.hit_min_height_m < height) & (height < config.hit_max_height_m)
     is_hit = is_hit & (rho < num_ranges * range_cell_m)
-    hit_range = (rho / range_cell_m).astype(jnp.int32)
-    hits = jnp.zeros(size, bool).at[place(is_hit, hit_range)].set(True, mode="drop")
 
     drop = height - sensor_height_m
     downward = returned & (drop < -1e-3)
@@ -116,12 +98,16 @@ def build_evidence(
     first = jnp.minimum((first_m / range_cell_m).astype(jnp.int32) + 1, num_ranges)
     last = jnp.minimum((last_m / range_cell_m).astype(jnp.int32), num_ranges)
     is_free = downward & (last_m > first_m) & (last > first)
-    beams = count_changes(size, place(is_free, first), place(is_free, last))
-
-    shape = (num_blocks, BLOCK, num_azimuths)
+    free, hit = draw_beams(
+        azimuth_cell(arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths),
+        (is_hit, (rho / range_cell_m).astype(jnp.int32)),
+        (is_free, first, last),
+        num_columns=num_azimuths,
+        num_cells=num_ranges,
+    )
     return Evidence(
-        free=covered_words(beams.reshape(shape)),
-        hit=next_words(hits.reshape(shape)),
+        free=free,
+        hit=hit,
         support=_ground_support(xyz, height, mask, config.support_height_m),
         num_ranges=num_ranges,
     )
@@ -195,10 +181,15 @@ def cast_rays(evidence: Evidence, boxes: FlatBoxes, config: EvidenceConfig, *, n
     center, shape = boxes.center.reshape(-1, 2), boxes.center.shape[:-1]
     sides = (jnp.broadcast_to(a, shape).reshape(-1) for a in (boxes.length, boxes.width, boxes.yaw))
     length, width, yaw = sides
-    fan = materialize(_ray_fan(center, length / 2, width / 2, yaw))
     axis = fast_axis()
-    azimuth, enter, leave = materialize(_ray_stretches(fan, num_rays, axis))
-    met = materialize(_sort_rays(evidence, azimuth, enter, leave, config.range_cell_m))
+    met = apply_in_turn(
+        [
+            lambda boxes: _ray_fan(*boxes),
+            lambda fan: _ray_stretches(fan, num_rays, axis),
+            lambda stretches: _sort_rays(evidence, *stretches, config.range_cell_m),
+        ],
+        (center, length / 2, width / 2, yaw),
+    )
     # Counts of rays in float32, which are exact.
     sums = (jnp.sum(a, axis=axis, dtype=jnp.float32).reshape(shape) for a in met)
     hit, free, deep, crosses, free_cells, cells = sums

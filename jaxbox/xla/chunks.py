@@ -56,9 +56,6 @@ RUN_BLOCKS, RUN_BLOCKS_ON_ACCELERATOR = 1024, 8192
 RANKS = 16
 """Rows that all others are compared with in one step."""
 
-OVERLAP_TILE = 32
-"""Rows and columns of the matrix of overlaps at a time: the bits of a word, and no other number."""
-
 OWNERS = 4096
 """Points whose detections are looked up at a time."""
 

@@ -39,6 +39,10 @@ class PointLists:
         """(K,) int32, points of each cluster that are looked at."""
         return jnp.minimum(self.total, self.max_points)
 
+    def count_of(self, cluster: jax.Array) -> jax.Array:
+        """(C,) int32, the `count` of some clusters: (C,) int32, in [0, K]; the latter has none."""
+        return jnp.minimum(take(self.total, cluster), self.max_points)
+
     def table(self, cluster: jax.Array) -> PointTable:
         """The points of some clusters, spread evenly over all they have: every (total / M)-th.
 
@@ -59,7 +63,7 @@ class PointLists:
             # Stored, since what a look-up has to work out first does not vectorise.
             row = materialize(self._row(start[None], total[None], index[:, None]))
             x, y = (jnp.take(values, row, mode="clip") for values in (self.x, self.y))
-        return x, y, jnp.minimum(total, self.max_points)
+        return x, y, self.count_of(cluster)
 
     def _row(self, start: jax.Array, total: jax.Array, j: jax.Array) -> jax.Array:
         """The row of the j-th point that is looked at of each cluster."""
