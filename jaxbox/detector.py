@@ -161,10 +161,13 @@ def score_boxes(completed: Completed, segments: Segments, config: DetectorConfig
     if seen is not None:
         num, num_rays = completed.hypotheses.num, config.completion.num_final_rays
         rays = evidence.weigh_boxes(seen, completed.boxes, num, config.evidence, num_rays=num_rays)
-    height_of = functools.partial(
-        ground.height_above_ground, planes=terrain.planes, surface=terrain.surface, config=config.ground
+    elevation = functools.partial(
+        ground.ground_elevation, planes=terrain.planes, surface=terrain.surface, config=config.ground
     )
-    return scoring.score_boxes(completed, rays, segments.clusters, segments.obstacles, height_of, config)
+    clusters, obstacles, lowest_z = segments.clusters, segments.obstacles, None
+    if config.ground.max_planes > 1:
+        lowest_z = clustering.lowest_z(segments.sweep.xyz[:, 2], obstacles, clusters)
+    return scoring.score_boxes(completed, rays, clusters, obstacles, elevation, lowest_z, config)
 
 
 def assemble(

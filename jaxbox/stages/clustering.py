@@ -13,7 +13,7 @@ from jaxbox.xla.components import NONE, CellGrids, label_components
 from jaxbox.xla.loops import map_rows
 from jaxbox.xla.maps import flag_cells, map_tables
 from jaxbox.xla.rows import compact, lookup_pair, pack_pairs, take
-from jaxbox.xla.segments import reduce_segments
+from jaxbox.xla.segments import reduce_segments, segment_minima
 from jaxbox.xla.sorting import compact_groups
 
 
@@ -260,7 +260,7 @@ def select_clusters(
     Args:
       statistics: of the C components.
       first: (maps + 1,) int32: first component of each map, and one past the last.
-      config: capacities of the maps, beyond which clusters are left out, and the gates on points and extent.
+      config: capacities of the maps, beyond which clusters are dropped, and the gates on points and extent.
       min_extent_m: least diagonal of the extents along x and y, m: no rectangle has a longer side.
 
     Returns:
@@ -305,6 +305,24 @@ def _find_clusters(
         prepare=lambda height: _in_slab(height, config),
         columns=obstacles.height,
     )
+
+
+def lowest_z(z: jax.Array, obstacles: Obstacles, clusters: Clusters) -> jax.Array:
+    """z of the lowest point of each cluster.
+
+    Args:
+      z: (N,) float32, m, of the sweep.
+      obstacles: O of its points.
+      clusters: of those.
+
+    Returns:
+      (P,) float32, m; 0 where a cluster has no point.
+    """
+    num_maps, num_clusters = clusters.of_point.shape[0], clusters.num_points.shape[0]
+    of_point = jnp.tile(take(z, obstacles.row), num_maps)
+    cluster = clusters.of_point.reshape(-1)
+    lowest = segment_minima(of_point, cluster, cluster < num_clusters, num_segments=num_clusters)
+    return jnp.where(jnp.isfinite(lowest), lowest, 0)
 
 
 def _in_slab(height: jax.Array, config: BoxConfig) -> jax.Array:
