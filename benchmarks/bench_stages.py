@@ -122,6 +122,20 @@ def floor(program: Any, rates: dict[str, float]) -> dict[str, float]:
     }
 
 
+def run_steps(cloud: PointCloud, config: DetectorConfig, run: Callable[..., Any]) -> None:
+    """Calls ``run(step, *inputs)`` for each step of detect(), on what it returned for the steps before."""
+    sweep = run(filtering.select_points, cloud, config.filtering, config.region)
+    terrain = run(ground.remove_ground, sweep, config.ground, jax.random.key(0))
+    obstacles = run(ground.gather_obstacles, sweep, terrain, config)
+    clusters = run(clustering.propose_clusters, obstacles, config)
+    outlines, rotations = run(detector.fit_rectangles, obstacles, clusters, config)
+    seen = run(evidence.observe, sweep, terrain, config.evidence)
+    segments = detector.Segments(sweep, terrain, obstacles, clusters, outlines, rotations, seen)
+    completed = run(detector.complete_boxes, segments, config)
+    candidates = run(detector.score_boxes, completed, segments, config)
+    run(detector.assemble, cloud, segments, completed, candidates, config)
+
+
 def time_steps(
     clouds: Sequence[PointCloud], config: DetectorConfig, rates: dict[str, float]
 ) -> dict[str, dict[str, float]]:
@@ -141,16 +155,7 @@ def time_steps(
         return result
 
     for cloud in clouds:
-        sweep = run(filtering.select_points, cloud, config.filtering, config.region)
-        terrain = run(ground.remove_ground, sweep, config.ground, jax.random.key(0))
-        obstacles = run(ground.gather_obstacles, sweep, terrain, config)
-        clusters = run(clustering.propose_clusters, obstacles, config)
-        outlines, rotations = run(detector.fit_rectangles, obstacles, clusters, config)
-        seen = run(evidence.observe, sweep, terrain, config.evidence)
-        segments = detector.Segments(sweep, terrain, obstacles, clusters, outlines, rotations, seen)
-        completed = run(detector.complete_boxes, segments, config)
-        candidates = run(detector.score_boxes, completed, segments, config)
-        run(detector.assemble, cloud, segments, completed, candidates, config)
+        run_steps(cloud, config, run)
     return {name: common.spread(spent[name]) | floors[name] for name in STEPS}
 
 

@@ -174,6 +174,30 @@ def test_a_checkout_runs_its_own_jaxbox_and_says_what_is_wrong(benchmark, tmp_pa
             checkout.detect(tmp_path / "absent.npy")
 
 
+def test_every_chunk_size_has_a_benchmark_or_what_chose_it(benchmark):
+    sizes, stages = benchmark("bench_chunks"), benchmark("bench_stages")
+    names = {name for name in vars(sizes.chunks) if name.isupper()}
+    assert names == sizes.USES.keys() | sizes.FIXED.keys()
+    assert not sizes.USES.keys() & sizes.FIXED.keys()
+    assert {use.step for use in sizes.USES.values()} <= set(stages.STEPS)
+
+
+def test_a_step_is_compiled_with_another_chunk_size_and_the_table_is_as_before(benchmark):
+    sizes = benchmark("bench_chunks")
+    before = sizes.chunks.RAYS
+
+    def step(values):
+        return values + sizes.chunks.RAYS
+
+    assert int(sizes.compile_with("RAYS", 7, step, (np.int32(1),))(np.int32(1))) == 8
+    assert before == sizes.chunks.RAYS
+    times = sizes.time_sizes("RAYS", step, [(np.int32(1),), (np.int32(2),)], 2)
+    assert list(times) == [before // 2, before, 2 * before]
+    assert all(0 < ms < 1e3 for ms in times.values())
+    with pytest.raises(SystemExit, match="NOTHING: choose from FILTER_BLOCKS"):
+        sizes.main(["NOTHING"])
+
+
 def test_bits_of_a_batch_are_compared_with_each_single(benchmark):
     scaling = benchmark("bench_scaling")
     batch = {"a": np.array([[1.0, 2.0], [3.0, 4.0]])}

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 from jaxbox.config import FilterConfig, RegionConfig
 from jaxbox.stages.state import Sweep
 from jaxbox.types import PointCloud
-from jaxbox.xla.chunks import FILTER_BLOCK_CELLS
+from jaxbox.xla import chunks
 from jaxbox.xla.grids import map_cells, sum_cells, window_sums
 from jaxbox.xla.rows import keep_rows, masked_mean, masked_std
 
 MAX_ABS_Z_M = 100.0
-"""Points farther above or below the sensor are faults: one alone would stretch the spread of the whole
-sweep, by which outliers are told, and beyond 1e19 m its square overflows."""
+"""Points farther above or below the sensor are errors of measurement: one alone would inflate the
+deviation by which outliers are found, and beyond 1e19 m its square overflows."""
 
 
 MIN_DENSITY = 1e-6
@@ -71,7 +71,7 @@ def filter_outliers(xyz1: jax.Array, config: FilterConfig, region: RegionConfig)
     # A line of cells along y for each x and level, with an empty cell before and some after it. Between the
     # lines of two x lies an empty one, which is margin to both.
     stride, margin = num_levels + 1, num_levels + 2
-    width = -(-(num_y + 2) // FILTER_BLOCK_CELLS) * FILTER_BLOCK_CELLS
+    width = -(-(num_y + 2) // chunks.FILTER_BLOCK_CELLS) * chunks.FILTER_BLOCK_CELLS
 
     def cell_of(points: jax.Array) -> jax.Array:
         x, y, z = (
