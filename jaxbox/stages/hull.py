@@ -168,7 +168,7 @@ def extreme_points(
     """The points of each cluster that can reach its hull: the extremes of thin slices.
 
     The cluster's bounding box is cut into slices along x, and along y; each slice keeps its two extreme
-    points across. A point left out lies between two kept ones of its slice, so the hull of the kept
+    points across. A dropped point lies between two kept ones of its slice, so the hull of the kept
     points is nowhere farther than one slice's width from the true hull, plus a rounding of at most
     extent / 2^11 for sweeps of up to a million points.
 

@@ -282,7 +282,7 @@ def _hides(near: Vehicle, far: Vehicle) -> bool:
 def _draw_clutter(
     rng: np.random.Generator, terrain: Terrain, vehicles: tuple[Vehicle, ...]
 ) -> tuple[Thing, ...]:
-    """Rows of clutter on both sides of the road, left out where a vehicle stands."""
+    """Rows of clutter on both sides of the road, except where a vehicle stands."""
     taken = [outline(vehicle) for vehicle in vehicles]
     things: list[Thing] = []
     for side in (-1, 1):

@@ -147,15 +147,15 @@ def fold_points(
     if on_accelerator():
         # Points along the last axis, which reductions read without transposing, see `PointLists.table`.
         of_point = jax.vmap(functools.partial(update, init), out_axes=-1)(x, y)
-        exists = jnp.arange(capacity, dtype=jnp.int32)[None] < count[:, None]
+        valid = jnp.arange(capacity, dtype=jnp.int32)[None] < count[:, None]
         return jax.tree.map(
-            lambda values, none: reduce(jnp.where(exists, values, none[..., None]), axis=-1), of_point, init
+            lambda values, none: reduce(jnp.where(valid, values, none[..., None]), axis=-1), of_point, init
         )
 
-    there, unroll = jnp.arange(capacity, dtype=jnp.int32)[:, None] < count[None], chunks.FOLDED_POINTS
+    valid, unroll = jnp.arange(capacity, dtype=jnp.int32)[:, None] < count[None], chunks.FOLDED_POINTS
 
     def fill(values: jax.Array, value: Any) -> jax.Array:
-        filled = jnp.where(there, values, value)
+        filled = jnp.where(valid, values, value)
         more = jnp.broadcast_to(jnp.asarray(value, values.dtype), (-capacity % unroll, values.shape[1]))
         return jnp.concatenate([filled, more])
 

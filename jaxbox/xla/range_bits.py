@@ -28,7 +28,7 @@ def count_changes(size: int, first: jax.Array, last: jax.Array) -> jax.Array:
 
     Args:
       size: static, number of cells.
-      first: (N,) int32 cells; those beyond the last are left out.
+      first: (N,) int32 cells; those beyond the last are ignored.
       last: (N,) int32, likewise.
 
     Returns:

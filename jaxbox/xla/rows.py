@@ -151,7 +151,7 @@ def compact(mask: jax.Array, capacity: int, *, num: jax.Array | None = None) -> 
 
     Args:
       mask: (N,) bool, or (M, N), whose rows are gone through one after the other.
-      capacity: static; entries beyond it are left out.
+      capacity: static; entries beyond it are dropped.
       num: () int32: no entry of a row is True beyond this many, which may be more than N.
         A CPU does not look at them.
 

@@ -49,7 +49,7 @@ def suppress_conflicts(rows: jax.Array, valid: jax.Array, conflict: Conflict) ->
 
 
 def _suppress_parallel(rows: jax.Array, valid: jax.Array, conflict: Conflict) -> jax.Array:
-    """As `suppress_conflicts`, all pairs at once, and some rounds before the host looks whether they do."""
+    """As `suppress_conflicts`, all pairs in parallel, several rounds before each check for convergence."""
     row = jnp.arange(valid.shape[0], dtype=jnp.int32)
     rivals = _all_pairs(conflict, rows, rows) & (row[None] < row[:, None])
 
