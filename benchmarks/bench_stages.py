@@ -1,16 +1,23 @@
 """Times detect() on real sweeps, whole and step by step, next to what the machine could do at the best.
 
     python -m benchmarks.bench_stages [--preset paper] [--quick] [--json FILE]
+    python -m benchmarks.bench_stages --against ANOTHER_CHECKOUT [--preset paper] [--quick] [--json FILE]
 
 Compile time is apart. The whole is timed from a host array to boxes on the host, and on the device alone;
 each pass goes over different sweeps. A step is timed as a compiled function of its own, so the steps need
 not add up to the whole. Its floor is the longer of two times: its inputs and outputs through the memory
 once, and the arithmetic that the compiler counts (loops once) at the machine's best rate; both rates are
 measured in the same run. On an accelerator the same command measures that.
+
+With ``--against`` whole sweeps of this checkout and of another one, which ``git worktree add`` makes of any
+commit, are timed in turn instead: see `benchmarks.in_turn`.
 """
 
 import argparse
+import contextlib
 import functools
+import pathlib
+import tempfile
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -19,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxbox
-from benchmarks import common
+from benchmarks import common, in_turn
 from jaxbox import DetectorConfig, PointCloud, detector
 from jaxbox.io import Sweep
 from jaxbox.run import compiled
@@ -115,6 +122,20 @@ def floor(program: Any, rates: dict[str, float]) -> dict[str, float]:
     }
 
 
+def run_steps(cloud: PointCloud, config: DetectorConfig, run: Callable[..., Any]) -> None:
+    """Calls ``run(step, *inputs)`` for each step of detect(), on what it returned for the steps before."""
+    sweep = run(filtering.select_points, cloud, config.filtering, config.region)
+    terrain = run(ground.remove_ground, sweep, config.ground, jax.random.key(0))
+    obstacles = run(ground.gather_obstacles, sweep, terrain, config)
+    clusters = run(clustering.propose_clusters, obstacles, config)
+    outlines, rotations = run(detector.fit_rectangles, obstacles, clusters, config)
+    seen = run(evidence.observe, sweep, terrain, config.evidence)
+    segments = detector.Segments(sweep, terrain, obstacles, clusters, outlines, rotations, seen)
+    completed = run(detector.complete_boxes, segments, config)
+    candidates = run(detector.score_boxes, completed, segments, config)
+    run(detector.assemble, cloud, segments, completed, candidates, config)
+
+
 def time_steps(
     clouds: Sequence[PointCloud], config: DetectorConfig, rates: dict[str, float]
 ) -> dict[str, dict[str, float]]:
@@ -134,16 +155,7 @@ def time_steps(
         return result
 
     for cloud in clouds:
-        sweep = run(filtering.select_points, cloud, config.filtering, config.region)
-        terrain = run(ground.remove_ground, sweep, config.ground, jax.random.key(0))
-        obstacles = run(ground.gather_obstacles, sweep, terrain, config)
-        clusters = run(clustering.propose_clusters, obstacles, config)
-        outlines, rotations = run(detector.fit_rectangles, obstacles, clusters, config)
-        seen = run(evidence.observe, sweep, terrain, config.evidence)
-        segments = detector.Segments(sweep, terrain, obstacles, clusters, outlines, rotations, seen)
-        completed = run(detector.complete_boxes, segments, config)
-        candidates = run(detector.score_boxes, completed, segments, config)
-        run(detector.assemble, cloud, segments, completed, candidates, config)
+        run_steps(cloud, config, run)
     return {name: common.spread(spent[name]) | floors[name] for name in STEPS}
 
 
@@ -163,10 +175,49 @@ def read_all(sweeps: Sequence[Sweep]) -> list[tuple[np.ndarray, np.ndarray]]:
     return [sweep.read_points() for sweep in sweeps]
 
 
+def compare(options: argparse.Namespace) -> dict[str, Any]:
+    """Times of this checkout and of another one, taking turns on each sweep."""
+    sweeps = common.kitti_sweeps(QUICK_SWEEPS if options.quick else MIN_SWEEPS)
+    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+        files = [pathlib.Path(folder) / f"{i}.npy" for i in range(len(sweeps))]
+        for file, (xyz, intensity) in zip(files, read_all(sweeps), strict=True):
+            np.save(file, np.column_stack([xyz, intensity]))
+        this, other = (
+            stack.enter_context(in_turn.Checkout(place, options.preset, options.set))
+            for place in (common.PROJECT, options.against)
+        )
+        found = in_turn.take_turns((this, other), files, QUICK_PASSES if options.quick else PASSES)
+    return found | {"num_sweeps": len(files)}
+
+
+def print_turns(found: dict[str, Any], options: argparse.Namespace) -> None:
+    """Prints what `compare` found."""
+    means, medians = found["mean_of_least_ms"], found["median_ms"]
+    names = "this checkout", str(options.against)
+    common.print_table(
+        ["", "mean of each sweep's least ms", "median ms"], list(zip(names, means, medians, strict=True))
+    )
+    low, middle, high = found["ratio_quartiles"]
+    print(f"\n{found['num_sweeps']} sweeps, {options.preset}: {found['ratio_of_means']:.3f} times as long")
+    print(f"ratio of each turn: median {middle:.3f}, quartiles {low:.3f} and {high:.3f}")
+    print(f"{found['sweeps_with_other_boxes']} sweeps have other boxes")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Prints the tables and writes the report."""
     parser = common.parser(__doc__ or "", quick="fewer sweeps and passes")
+    parser.add_argument(
+        "--against",
+        type=pathlib.Path,
+        metavar="CHECKOUT",
+        help="time whole sweeps of this checkout and of another one in turn, instead of steps",
+    )
     options: argparse.Namespace = parser.parse_args(arguments)
+    if options.against is not None:
+        found = compare(options)
+        print_turns(found, options)
+        common.write_report({"turns": found}, options)
+        return
     config = jax.tree.map(float, common.chosen_config(options))
     points = read_all(common.kitti_sweeps(QUICK_SWEEPS if options.quick else None))
     if not options.quick and len(points) < MIN_SWEEPS:

@@ -8,7 +8,6 @@ import functools
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 
 from jaxbox.config import DetectorConfig
 from jaxbox.stages import (
@@ -36,7 +35,7 @@ from jaxbox.stages.state import (
     Sweep,
 )
 from jaxbox.types import Detections, PointCloud
-from jaxbox.xla.barriers import materialize, outline
+from jaxbox.xla.barriers import opaque_zeros, outline
 
 
 class Segments(NamedTuple):
@@ -138,10 +137,9 @@ def complete_boxes(segments: Segments, config: DetectorConfig) -> Completed:
     """
     clusters, rotations, seen = segments.clusters, segments.rotations, segments.evidence
     cast = None if seen is None else functools.partial(evidence.cast_rays, seen, config=config.evidence)
-    preference = jnp.zeros(config.box.num_angles, jnp.float32)
+    preference = opaque_zeros(config.box.num_angles)
     if config.box.scene_direction and cast is not None:
-        none = materialize(preference)  # What is known to be zeros would have a program of its own.
-        unbiased = rectangles.choose_rectangles(rotations, clusters.num, none)
+        unbiased = rectangles.choose_rectangles(rotations, clusters.num, preference)
         preference = direction.scene_preference(unbiased, clusters, cast, config)
     candidates = rectangles.rectangle_candidates(rotations, clusters.num, preference, config)
     return completion.complete_boxes(candidates, segments.outlines.points, clusters, cast, config)
@@ -163,10 +161,13 @@ def score_boxes(completed: Completed, segments: Segments, config: DetectorConfig
     if seen is not None:
         num, num_rays = completed.hypotheses.num, config.completion.num_final_rays
         rays = evidence.weigh_boxes(seen, completed.boxes, num, config.evidence, num_rays=num_rays)
-    height_of = functools.partial(
-        ground.height_above_ground, planes=terrain.planes, surface=terrain.surface, config=config.ground
+    elevation = functools.partial(
+        ground.ground_elevation, planes=terrain.planes, surface=terrain.surface, config=config.ground
     )
-    return scoring.score_boxes(completed, rays, segments.clusters, segments.obstacles, height_of, config)
+    clusters, obstacles, lowest_z = segments.clusters, segments.obstacles, None
+    if config.ground.max_planes > 1:
+        lowest_z = clustering.lowest_z(segments.sweep.xyz[:, 2], obstacles, clusters)
+    return scoring.score_boxes(completed, rays, clusters, obstacles, elevation, lowest_z, config)
 
 
 def assemble(

@@ -344,6 +344,11 @@ def test_loops_and_what_else_is_for_a_compiler_are_in_xla(path):
         assert not set(names_in(tree)) & FOR_A_COMPILER
 
 
+@pytest.mark.parametrize("path", outside("xla"), ids=relative)
+def test_only_xla_says_what_is_materialized(path):
+    assert "materialize" not in names_in(parsed(path))
+
+
 @pytest.mark.parametrize("path", outside("xla", "run"), ids=relative)
 def test_only_xla_and_run_ask_what_a_program_is_built_for(path):
     assert "on_accelerator" not in names_in(parsed(path))

@@ -1,5 +1,6 @@
 """Parity with the reference end to end: the same boxes from the same sweep, for all presets."""
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -114,3 +115,35 @@ def test_the_form_for_accelerators_finds_what_the_form_for_a_cpu_does(cases, pre
         moved, total = moved + (~same).sum(), total + len(same)
         parity.assert_within((boxes - others)[same, 7], 1e-5, f"scores of {preset}")
     parity.assert_share(moved, total, 0.03, f"boxes of {preset}, placed otherwise")
+
+
+def terrace_with_cars():
+    """(n, 3) float32 m: a road, a terrace above it, and the two faces of a car on each that are seen."""
+    rng = np.random.default_rng(0)
+    xy = rng.uniform([-40, -20], [40, 20], (30_000, 2))
+    xy = xy[np.hypot(*xy.T) > 3]
+    ground_z = np.where(xy[:, 1] > 5, TERRACE_Z, ROAD_Z)
+    points = [np.column_stack([xy, rng.normal(ground_z, 0.01)])]
+    for y, ground_z in ((-6.0, ROAD_Z), (9.0, TERRACE_Z)):
+        up = rng.uniform(ground_z + 0.2, ground_z + 1.5, 1000)
+        points.append(
+            np.column_stack([rng.uniform(10, 14, 600), np.full(600, y - np.sign(y) * 0.8), up[:600]])
+        )
+        points.append(np.column_stack([np.full(400, 10.0), rng.uniform(y - 0.8, y + 0.8, 400), up[600:]]))
+    return np.concatenate(points).astype(np.float32)
+
+
+ROAD_Z, TERRACE_Z = -1.7, -0.5
+
+
+def test_on_several_planes_boxes_stand_where_those_of_the_reference_do():
+    paper = PRESETS["paper"]
+    ground = dataclasses.replace(paper.ground, max_planes=2, surface=True)
+    config, xyz = dataclasses.replace(paper, ground=ground), terrace_with_cars()
+    bottoms = []
+    for found in (jaxbox.detect(jaxbox.PointCloud.from_numpy(xyz), config), reference.detect(xyz, config)):
+        boxes = boxes_of(found)
+        bottoms.append((boxes[:, 2] - boxes[:, 5] / 2)[np.argsort(boxes[:, 1])])
+    np.testing.assert_allclose(bottoms[0], bottoms[1], atol=0.02)
+    # The paper's boxes begin at the lowest point of the cluster above the ground.
+    np.testing.assert_allclose(bottoms[0], [ROAD_Z + 0.2, TERRACE_Z + 0.2], atol=0.15)

@@ -77,15 +77,16 @@ def test_planes_of_different_draws_agree_where_one_has_decisive_support(cases):
 
 
 # Gaussians of the default reach as far as the band of their matrix, the wider ones beyond it.
-@pytest.mark.parametrize("wider", [0.5, 1, 2])
-def test_surface_is_that_of_the_reference_on_the_same_plane(cases, wider):
+@pytest.mark.parametrize(("wider", "num_planes"), [(0.5, 1), (1, 1), (2, 1), (1, 2)])
+def test_surface_is_that_of_the_reference_on_the_same_planes(cases, wider, num_planes):
     config = dataclasses.replace(GROUND, smoothing_m=wider * GROUND.smoothing_m)
     for case in cases:
         xyz = parity.pad(case.xyz, parity.CAPACITY)
         mask = parity.pad(case.inlier, parity.CAPACITY)
-        surface = np.asarray(fit_ground_surface(xyz, mask, case.plane, config))
+        planes = np.stack([case.plane, case.plane + np.float32([0.01, 0, 0.8])])[:num_planes]
+        surface = np.asarray(fit_ground_surface(xyz, mask, planes, config))
         inliers = case.xyz[case.inlier].astype(float)
-        expected = reference.fit_ground_surface(inliers, case.plane, config)
+        expected = reference.fit_ground_surface(inliers, planes, config)
         # A point on the edge of a cell may round into either: that moves the ground a little, round about.
         differ = np.abs(surface - expected)
         parity.assert_share(np.sum(differ > 2e-5), differ.size, 0.01, "surface")

@@ -926,6 +926,7 @@ def test_components_of_a_real_sweep_hold_each_detection_in_one_piece(real_detect
 NO_TWIN = {
     "clustering.arrange_grids": "lays the cells of all maps in one row",
     "clustering.find_statistics": "fills a table; select_clusters of the reference goes by the points",
+    "clustering.lowest_z": "a minimum over the points of each cluster",
     "descriptors.point_moments": "sums over lists; shape_descriptors of the reference goes by the points",
     "hull.extreme_points": "thins out what cannot reach the hull",
     "hull.find_bounds": "the frame of those",

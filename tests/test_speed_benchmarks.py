@@ -115,6 +115,89 @@ def test_throughput_is_measured_by_cores_on_a_cpu_and_by_devices_on_accelerators
     assert [(row["sweeps_per_s"], row["times_the_first"]) for row in rows] == [(1, 1), (2, 2)] * 2
 
 
+def test_checkouts_that_take_turns_are_held_against_each_other(benchmark, tmp_path):
+    in_turn = benchmark("in_turn")
+    calls = []
+
+    class Fake:
+        def __init__(self, name, ms, boxes):
+            self.name, self.ms, self.boxes = name, ms, boxes
+
+        def detect(self, sweep):
+            calls.append((self.name, sweep))
+            return self.ms, self.boxes.get(sweep, "same")
+
+    one, other = Fake("one", 3.0, {"b": "moved"}), Fake("other", 4.0, {})
+    found = in_turn.take_turns((one, other), ["a", "b"], 2)
+    assert found["mean_of_least_ms"] == [3.0, 4.0]
+    assert (found["ratio_of_means"], found["ratio_quartiles"]) == (0.75, [0.75] * 3)
+    assert found["sweeps_with_other_boxes"] == 1
+    turns = [[name for name, _ in calls[2 + k : 4 + k]] for k in range(0, 8, 2)]
+    assert turns == [["one", "other"], ["other", "one"], ["other", "one"], ["one", "other"]]
+    assert [sweep for _, sweep in calls[2:]] == list("aabb") * 2
+
+
+def test_the_least_times_and_the_ratios_of_turns_are_told(benchmark):
+    in_turn = benchmark("in_turn")
+    spent_ms = np.array([[[1.0, 4.0], [3.0, 2.0]], [[2.0, 4.0], [2.0, 8.0]]])
+    found = in_turn.summarize_turns(spent_ms)
+    assert found["mean_of_least_ms"] == [1.5, 3.0]
+    assert found["median_ms"] == [2.5, 3.0]
+    assert found["ratio_quartiles"] == np.percentile([0.5, 1.0, 1.5, 0.25], [25, 50, 75]).tolist()
+
+
+FAKE_JAXBOX = """
+import dataclasses, types
+import numpy as np
+class DetectorConfig:
+    presets = staticmethod(lambda: {"default": 0.0})
+class PointCloud:
+    from_numpy = staticmethod(lambda xyz, intensity: xyz)
+def detect(cloud, config):
+    return types.SimpleNamespace(**dict.fromkeys(["center", "size", "yaw", "score", "label", "valid"], cloud))
+"""
+
+
+def test_a_checkout_runs_its_own_jaxbox_and_says_what_is_wrong(benchmark, tmp_path):
+    in_turn = benchmark("in_turn")
+    with pytest.raises(SystemExit, match="not a checkout of jaxbox"):
+        in_turn.Checkout(tmp_path, "default")
+    (tmp_path / "jaxbox").mkdir()
+    (tmp_path / "jaxbox" / "__init__.py").write_text(FAKE_JAXBOX)
+    np.save(tmp_path / "a.npy", np.zeros((5, 4), np.float32))
+    np.save(tmp_path / "b.npy", np.ones((5, 4), np.float32))
+    with in_turn.Checkout(tmp_path, "default") as checkout:
+        zeros, ones, again = (checkout.detect(tmp_path / f"{name}.npy") for name in "aba")
+        assert zeros[0] > 0
+        assert zeros[1] == again[1] != ones[1]
+        with pytest.raises(SystemExit, match="ended with exit code 1"):
+            checkout.detect(tmp_path / "absent.npy")
+
+
+def test_every_chunk_size_has_a_benchmark_or_what_chose_it(benchmark):
+    sizes, stages = benchmark("bench_chunks"), benchmark("bench_stages")
+    names = {name for name in vars(sizes.chunks) if name.isupper()}
+    assert names == sizes.USES.keys() | sizes.FIXED.keys()
+    assert not sizes.USES.keys() & sizes.FIXED.keys()
+    assert {use.step for use in sizes.USES.values()} <= set(stages.STEPS)
+
+
+def test_a_step_is_compiled_with_another_chunk_size_and_the_table_is_as_before(benchmark):
+    sizes = benchmark("bench_chunks")
+    before = sizes.chunks.RAYS
+
+    def step(values):
+        return values + sizes.chunks.RAYS
+
+    assert int(sizes.compile_with("RAYS", 7, step, (np.int32(1),))(np.int32(1))) == 8
+    assert before == sizes.chunks.RAYS
+    times = sizes.time_sizes("RAYS", step, [(np.int32(1),), (np.int32(2),)], 2)
+    assert list(times) == [before // 2, before, 2 * before]
+    assert all(0 < ms < 1e3 for ms in times.values())
+    with pytest.raises(SystemExit, match="NOTHING: choose from FILTER_BLOCKS"):
+        sizes.main(["NOTHING"])
+
+
 def test_bits_of_a_batch_are_compared_with_each_single(benchmark):
     scaling = benchmark("bench_scaling")
     batch = {"a": np.array([[1.0, 2.0], [3.0, 4.0]])}

@@ -1,4 +1,4 @@
-"""Tuning: what is tried, what is chosen, and that nothing left out has a say in it."""
+"""Tuning: what is tried, what is chosen, and that nothing held out has a say in it."""
 
 import numpy as np
 import pytest

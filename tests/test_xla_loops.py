@@ -32,6 +32,12 @@ def test_materialize_is_the_identity():
 
 
 @pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("shape", [(), (5,), (2, 0, 3)])
+def test_opaque_zeros_are_zeros(shape):
+    assert_same_tree(jax.jit(lambda: barriers.opaque_zeros(*shape))(), np.zeros(shape, np.float32))
+
+
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("call", [barriers.outline, barriers.single_kernel])
 def test_an_outlined_function_or_one_in_a_single_kernel_gives_what_it_gives_when_called(call):
     def function(tree, offset):

@@ -73,6 +73,13 @@ def test_packed_bits_are_the_flags_and_count_and_begin_as_those_do(shape):
     np.testing.assert_array_equal(bits.pack_bits(flags.astype(np.uint8)), bits.pack_bits(flags))
 
 
+@pytest.mark.parametrize("num_flags", [1, 16, 32])
+def test_joined_bits_are_those_that_are_packed(num_flags):
+    flags = np.random.default_rng(num_flags).random((num_flags, 3, 5)) < 0.5
+    joined = bits.join_bits(list(jnp.asarray(flags)))
+    np.testing.assert_array_equal(joined, bits.pack_bits(jnp.asarray(flags), axis=0)[0])
+
+
 def test_every_bit_of_a_word_can_be_the_lowest_or_the_only_one():
     place = np.arange(32, dtype=np.uint32)
     for words in (np.uint32(1) << place, np.uint32(2**32 - 1) << place):
@@ -145,6 +152,20 @@ def test_refit_plane_keeps_a_plane_that_the_inliers_leave_open(inliers):
 
 
 # Grids.
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize(("num_rows", "num_cells"), [(1, 1), (50, 7), (3000, 40)])
+def test_rows_are_summed_by_cell(num_rows, num_cells):
+    rng = np.random.default_rng(num_rows)
+    rows = rng.integers(0, num_cells, (num_rows, 4)).astype(np.float32)
+    cell, sums = jax.jit(
+        lambda rows: grids.sum_cells(lambda r: r[:, 0].astype(jnp.uint32), rows, num_cells=num_cells)
+    )(rows)
+    np.testing.assert_array_equal(cell, rows[:, 0])
+    expected = np.zeros((num_cells, 4), np.float32)
+    np.add.at(expected, rows[:, 0].astype(int), rows)
+    np.testing.assert_array_equal(sums, expected)
 
 
 @pytest.mark.usefixtures("platform")

@@ -145,6 +145,26 @@ def test_lookup_is_what_numpy_indexes(shape, places):
     np.testing.assert_array_equal(found, table[tuple(index)])
 
 
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("shape", [(7,), (5, 3), (4, 6, 5)])
+def test_the_same_entries_are_looked_up_in_each_table(shape):
+    rng = np.random.default_rng(len(shape))
+    tables = rng.normal(size=(3, *shape)).astype(np.float32)
+    index = [rng.integers(0, size, (2, 4), np.int32) for size in shape]
+    found = jax.jit(lambda tables, *index: rows.lookup_each(list(tables), *index))(tables, *index)
+    np.testing.assert_array_equal(found, tables[:, *index])
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("density", [0.0, 0.5, 1.0])
+def test_rows_that_are_not_kept_are_zeros_whatever_they_hold(density):
+    rng = np.random.default_rng(0)
+    values, keep = rng.normal(size=(50, 4)).astype(np.float32), rng.random(50) < density
+    values[~keep] = np.nan
+    kept = jax.jit(functools.partial(rows.keep_rows))(values, keep)
+    np.testing.assert_array_equal(kept, np.where(keep[:, None], values, 0))
+
+
 @pytest.mark.parametrize("size", [1, 2, 1000])
 def test_a_pair_is_looked_up_as_the_number_and_the_flag(size):
     rng = np.random.default_rng(size)

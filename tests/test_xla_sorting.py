@@ -1,6 +1,7 @@
 """Laws of rows by group and by score, in both forms, against NumPy's stable sorts."""
 
 import functools
+import itertools
 
 import chex
 import jax
@@ -47,6 +48,30 @@ def test_largest_first_is_a_stable_sort_by_descending_size_on_every_platform(max
     order, place = sorting.largest_first(jnp.asarray(size), max_size)
     np.testing.assert_array_equal(order, np.argsort(-size, kind="stable"))
     np.testing.assert_array_equal(order[place], np.arange(700))
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("capacities", [[3], [1, 4], [100, 2, 1, 50]])
+@pytest.mark.parametrize("density", [0.0, 0.4, 1.0])
+def test_groups_are_compacted_each_to_its_capacity_and_joined(capacities, density):
+    rng, size = np.random.default_rng(len(capacities)), 90
+    for last in (1, 30, size):
+        inner = np.sort(rng.integers(1, last + 1, len(capacities) - 1))
+        first = np.array([1, *inner, last], np.int32)
+        place = np.arange(size)
+        keep = (rng.random(size) < density) & (place >= 1) & (place < last)
+        found = [np.flatnonzero(keep[a:b]) + a for a, b in itertools.pairwise(first)]
+        kept = [rows[:capacity] for rows, capacity in zip(found, capacities, strict=True)]
+        member = np.concatenate(kept)
+        row = np.full(size, sum(capacities))
+        row[member] = np.arange(len(member))
+        listed = jax.jit(lambda k, f: sorting.compact_groups(k, f, capacities))(keep, first)
+        np.testing.assert_array_equal(listed.row, row)
+        np.testing.assert_array_equal(listed.member[: len(member)], member)
+        np.testing.assert_array_equal(listed.member[len(member) :], size)
+        np.testing.assert_array_equal(listed.found, [len(rows) for rows in found])
+        np.testing.assert_array_equal(listed.kept, [len(rows) for rows in kept])
+        assert int(listed.num) == len(member)
 
 
 @pytest.mark.usefixtures("platform")

@@ -9,7 +9,7 @@ import parity
 import pytest
 from scipy import ndimage
 
-from jaxbox.xla import chunks, components, hulls, maps, ragged, range_bits, runs, segments, suppression
+from jaxbox.xla import bits, chunks, components, hulls, maps, ragged, range_bits, runs, segments, suppression
 
 # Segments.
 
@@ -233,6 +233,25 @@ def test_next_set_is_the_first_flag_at_a_cell_or_beyond(num_blocks, num_columns)
 
 
 @pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize(("num_cells", "num_columns"), [(1, 1), (15, 3), (40, 5)])
+@pytest.mark.parametrize("num_beams", [1, 60])
+def test_beams_are_drawn_cell_by_cell(num_cells, num_columns, num_beams):
+    rng = np.random.default_rng(num_cells)
+    column = rng.integers(0, num_columns, num_beams, np.int32)
+    hit = rng.random(num_beams) < 0.5, rng.integers(0, num_cells, num_beams, np.int32)
+    first, last = np.sort(rng.integers(0, num_cells + 1, (2, num_beams), np.int32), axis=0)
+    free = (rng.random(num_beams) < 0.5) & (first < last), first, last
+    draw = jax.jit(lambda *beams: range_bits.draw_beams(*beams, num_columns=num_columns, num_cells=num_cells))
+    words = draw(column, hit, free)
+    is_free, is_hit = np.zeros((2, (num_cells // range_bits.BLOCK + 1) * range_bits.BLOCK, num_columns), bool)
+    is_hit[hit[1][hit[0]], column[hit[0]]] = True
+    for k, begin, end in zip(column[free[0]], first[free[0]], last[free[0]], strict=True):
+        is_free[begin:end, k] = True
+    np.testing.assert_array_equal(range_bits.flagged_cells(words[0]), is_free)
+    np.testing.assert_array_equal(range_bits.flagged_cells(words[1]), is_hit)
+
+
+@pytest.mark.usefixtures("platform")
 def test_words_at_are_those_of_the_cells_blocks_in_each_table():
     rng = np.random.default_rng(0)
     tables = rng.integers(0, 2**32, (2, 5, 7), np.uint32)
@@ -356,7 +375,7 @@ def test_lower_hulls_are_monotone_chains_set_by_set(num_points, kind):
 
 
 @pytest.mark.usefixtures("platform")
-@pytest.mark.parametrize("size", [1, chunks.OVERLAP_TILE - 1, chunks.OVERLAP_TILE, 100])
+@pytest.mark.parametrize("size", [1, bits.WORD_BITS - 1, bits.WORD_BITS, 100])
 def test_conflicts_are_suppressed_as_by_the_greedy_loop(size):
     suppress = jax.jit(
         lambda rows, valid: suppression.suppress_conflicts(

@@ -334,7 +334,7 @@ def tune(
     changes: SetOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Another number tries other settings.")] = 0,
 ) -> None:
-    """Search settings on labelled sweeps, and say what they are worth on drives left out.
+    """Search settings on labelled sweeps, and evaluate them on held-out drives.
 
     Thresholds are traced: every trial runs in one compiled program. Each drive is scored with the setting
     that the other drives chose. Interrupted, it reports what is done and ends with exit code 1. Use the

@@ -48,7 +48,7 @@ class DetectOptions:
     capacity: int | None
     """Points a sweep is padded to, or None for what it needs."""
     min_score: float
-    """Lower scores are left out."""
+    """Boxes with lower scores are dropped."""
     points: bool
     """Whether MCAP and rerun files hold the points too."""
     pictures: bool
@@ -248,7 +248,7 @@ def _run_frame(
 def _write(
     sweep: io.Sweep, frame: Frame, options: DetectOptions, run: RunReport, results: Results
 ) -> FrameReport:
-    """Writes the results; that there are no pictures is said after that."""
+    """Writes the results, and then reports pictures that could not be drawn."""
     start = time.perf_counter()
     with undisturbed():
         record = results.write(

@@ -38,7 +38,7 @@ class RayOptions:
     capacity: int | None
     """Points a sweep is padded to, or None for what it needs."""
     min_score: float
-    """Lower scores are left out."""
+    """Boxes with lower scores are dropped."""
     resume: bool
     """Whether finished partitions are kept."""
     quiet: bool

@@ -14,7 +14,7 @@ from jaxbox.viz.judged import LEGEND
 SELECTION = Selection(difficulty="hard")
 """The labels that must be found: cars within KITTI's limits; beyond them a label is ignored."""
 TILES_PER_SHEET, TILES_PER_ROW, TILE_WIDTH_PX = 20, 4, 700
-"""At this width the captions of a tile can be read and twenty of them seen at once."""
+"""At this width the captions are legible and twenty tiles fit one sheet."""
 
 
 def write_judged_pictures(
@@ -26,7 +26,7 @@ def write_judged_pictures(
       read: sweeps, labels and results.
       folder: where to: ``NAME_eval.png``, and ``contact_sheet.png`` or, for many frames,
         ``contact_sheet_1.png`` and so on.
-      min_score: lower-scored boxes are left out.
+      min_score: boxes with lower scores are not drawn.
 
     Returns:
       The contact sheets.
@@ -59,7 +59,7 @@ def judge_frame(
       sweep: a labelled sweep.
       labels: its labels.
       results: what was found in it.
-      min_score: lower-scored boxes are left out.
+      min_score: boxes with lower scores are not drawn.
 
     Returns:
       The frame, ready to be drawn.

@@ -54,7 +54,7 @@ def run_eval(
       plots: folder for the plots; None for ``plots`` in the results' folder, if matplotlib is there.
       drives_path: file with the drive of each frame, or None.
       pictures: whether each frame is drawn, into ``pictures`` in the results' folder.
-      min_score: lower-scored boxes are left out of the pictures.
+      min_score: boxes with lower scores are not drawn.
       console: where the tables go.
 
     Raises:

@@ -1,4 +1,4 @@
-"""``jaxbox tune``: tries settings on labelled sweeps and says which hold on drives that were left out."""
+"""``jaxbox tune``: tries settings on labelled sweeps, and evaluates them on held-out drives."""
 
 import csv
 import dataclasses
@@ -120,7 +120,7 @@ def chosen_axes(options: TuneOptions) -> list[Axis]:
 
 
 def make_bench(labels: pathlib.Path, options: TuneOptions) -> Bench:
-    """Reads the labelled sweeps, and what is left out together.
+    """Reads the labelled sweeps, and the groups in which they are held out.
 
     Raises:
       InputError: where there are none, one cannot be read, or a frame has no drive.
@@ -217,7 +217,7 @@ def run_notes(report: dict[str, Any]) -> list[str]:
     done, planned = len(report["trials"]), report["num_planned"]
     ended = "interrupted; " if report["interrupted"] else ""
     groups = (
-        "No drives were given, so each sweep was left out by itself: sweeps of a drive resemble each other, "
+        "No drives were given, so each sweep was held out by itself: sweeps of a drive resemble each other, "
         "and the held-out figures are flattered."
         if report["drives"] is None
         else f"Groups are the drives of {report['drives']}."

@@ -32,7 +32,7 @@ MANIFEST = "manifest.json"
 CONFIG = "config.toml"
 """The exact settings, next to its partitions."""
 SWEEPS_PER_PARTITION = 256
-"""Some 10 s of work, which is what a worker that dies costs, in files that are worth opening."""
+"""About 10 s of work, which is what is lost when a worker dies, in files that are not too small."""
 _LOOKERS = 16
 """Threads that look at the partitions of an earlier run: each look waits for the file system."""
 _STORE_BYTES = 2**28
@@ -78,7 +78,7 @@ def detect_dataset(
       sweeps_per_partition: what a worker that dies costs at most, and how large the files are.
       batch: sweeps that a worker reads ahead and hands to `jaxbox.detect_batch`.
       capacity: points that every sweep is padded to; None for the bucket that holds it.
-      min_score: boxes that score less are left out.
+      min_score: boxes with lower scores are dropped.
       topic: of the points in recordings of several.
       resume: whether partitions of an earlier run that are complete and without failures are kept.
       on_report: told of each partition when it is done, and of how many there are to do.
@@ -137,7 +137,7 @@ def _ray(address: str | None, workers: int | None, cpus_per_worker: int) -> Iter
         options = {"address": address} if address else {"address": "local", **started_here}
         try:
             with warnings.catch_warnings():
-                # JAX warns of any fork; those of Ray run another program at once.
+                # JAX warns of any fork; those of Ray replace the process immediately.
                 warnings.filterwarnings("ignore", r"os\.fork\(\)", RuntimeWarning)
                 ray.init(**options, log_to_driver=False, logging_level=logging.ERROR)
         except (RuntimeError, ConnectionError, ValueError) as error:
@@ -198,7 +198,7 @@ class _Run:
         self._store.write_text(CONFIG, config_to_toml(self.task.config))
         self._account(report, finished=False)
         try:
-            # Closed at once where it is left early, so that Ray ends the workers.
+            # Closed immediately on an early exit, so that Ray ends the workers.
             with contextlib.closing(self._results(missing, min(workers, max(1, len(missing))))) as results:
                 for done in results:
                     reports[done.name] = done

@@ -13,7 +13,7 @@ class PartitionReport:
     name: str
     """Of its file, without the suffix."""
     key: str
-    """Digest of its sweeps, and of settings and options: a file of another key is no result of it."""
+    """Digest of its sweeps, and of settings and options: a file with another key belongs to another run."""
     num_sweeps: int
     """Sweeps that belong to it."""
     num_boxes: int = 0

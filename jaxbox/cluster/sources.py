@@ -175,7 +175,7 @@ def _distinct(refs: list[SweepRef]) -> list[SweepRef]:
 
 
 class SweepReader:
-    """Reads sweeps by where they lie; several threads may ask at once."""
+    """Reads sweeps by their location; several threads may read concurrently."""
 
     def __init__(self, topic: str | None) -> None:
         """Reads nothing yet.

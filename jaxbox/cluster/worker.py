@@ -74,7 +74,7 @@ class Task:
     capacity: int | None
     """Points a sweep is padded to, or None for what it needs."""
     min_score: float
-    """Boxes that score less are left out."""
+    """Boxes with lower scores are dropped."""
     topic: str | None
     """Of the points in recordings."""
     batch: int

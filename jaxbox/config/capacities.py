@@ -15,10 +15,10 @@ import jax.numpy as jnp
 from jaxbox.config.presets import DetectorConfig
 
 CLOUD_CAPACITY = "PointCloud.from_numpy(capacity=...)"
-"""What sets N, the one capacity that is not of the configuration, and no row here; `Status.POINT_OVERFLOW`
+"""What sets N, the only capacity outside the configuration, which has no row here; `Status.POINT_OVERFLOW`
 says that it was too small."""
 PER_MAP = "clustering.maps[i]."
-"""How the field of a capacity begins that each component map has for itself."""
+"""Prefix of the fields that each component map has."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -36,7 +36,7 @@ class Capacity:
     share: fractions.Fraction | None = None
     """Of the cloud's capacity N: what None in the configuration stands for, rounded up."""
     only_if: tuple[str, Any] | None = None
-    """A field and the value with which the capacity is used at all; None where it always is."""
+    """A field and its value for which the capacity is used; None where it always is."""
 
     @property
     def is_per_map(self) -> bool:
@@ -69,7 +69,7 @@ class Capacity:
         return math.ceil(self.share * num_rows)
 
     def is_exceeded(self, counts: Any, config: DetectorConfig, num_rows: int) -> jax.Array:
-        """Whether more was there than it holds, in any map.
+        """Whether more was needed than it holds, on any map.
 
         Args:
           counts: `jaxbox.types.Counts` of a sweep, traced or not.

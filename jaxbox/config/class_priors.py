@@ -45,7 +45,7 @@ class ClassPrior:
     max_width_m: Scalar
     """Wider measured extents are not such a vehicle."""
     min_box_height_m: Scalar
-    """Boxes are at least so high: their tops read low."""
+    """Least height of a box: measured tops are too low."""
     prior_weight: Scalar
     """Factor of the score: how common the class is relative to the car, softened."""
     count_max_height_m: Scalar
@@ -73,7 +73,7 @@ class Label(enum.IntEnum):
     """Usual size, and gates."""
 
     def __new__(cls, prior: ClassPrior) -> "Label":
-        """The next number, which knows its prior."""
+        """A label with the next number, and its prior."""
         label = int.__new__(cls, len(cls.__members__))
         label._value_, label.prior = len(cls.__members__), prior
         return label

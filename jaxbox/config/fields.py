@@ -279,7 +279,7 @@ def differing_names(
     earlier: DetectorConfig,
     recorded: Mapping[str, Any],
 ) -> list[str]:
-    """Names of the settings and options in which a run differs from an earlier one that it would go on with.
+    """Names of the settings and options in which a run differs from the earlier one that it would resume.
 
     Args:
       config: the settings now.
@@ -295,7 +295,7 @@ def differing_names(
 
 
 def recorded_options(account: str | bytes) -> Mapping[str, Any]:
-    """The options that a run left in its account.
+    """The options recorded in the account of a run.
 
     Args:
       account: JSON with the options under "options".

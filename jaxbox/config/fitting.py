@@ -98,7 +98,7 @@ def _rough_height(xyz: np.ndarray) -> np.ndarray:
 
 
 def _rough_warp(xy: np.ndarray, config: ClusteringConfig) -> np.ndarray:
-    """Far points drawn together as the maps draw them, so that beyond the start cells hold more."""
+    """Compresses far ranges as the maps do, so that cells beyond the start hold more points."""
     rho = np.linalg.norm(xy, axis=1)
     beyond, growth = (
         np.maximum(rho - config.adaptive_start_m, 0),

@@ -15,7 +15,7 @@ from jaxbox.config.class_priors import ClassPrior, Label, Scalar
 _T = TypeVar("_T")
 
 DEFAULT_SCORE_THRESHOLD = 0.15
-"""Score from which a box is worth acting on: over sweeps whose labels go all round (Argoverse 2, PandaSet,
+"""Score from which to act on a box: over sweeps whose labels go all round (Argoverse 2, PandaSet,
 SemanticKITTI) more than 9 of 10 such boxes are vehicles, see ``benchmarks/results/sensors.json``."""
 
 GROUND_CANDIDATE_CELL_M = 1.0
@@ -35,7 +35,7 @@ def config_class(cls: type[_T]) -> type[_T]:
 
 @config_class
 class RegionConfig:
-    """The part of the world that is looked at; points outside are counted and left out.
+    """The part of the world that is looked at; points outside are counted and dropped.
 
     So are points 100 m or more above or below the sensor.
     """
@@ -118,7 +118,7 @@ class GroundConfig:
     min_height_m: Scalar = 0.2
     """A point higher above the ground than this is an obstacle; others are ground."""
     max_height_m: Scalar = 4.5
-    """A point higher above the ground than this is overhead, and left out."""
+    """A point higher above the ground than this is overhead, and dropped."""
 
 
 @config_class
@@ -161,9 +161,9 @@ class ClusteringConfig:
     adaptive_growth: Scalar = 0.005
     """Growth of the linking distance with range beyond the start, per metre; 0 keeps it fixed."""
     min_points: Scalar = 8.0
-    """Clusters with fewer points are left out."""
+    """Clusters with fewer points are dropped."""
     max_extent_m: Scalar = 12.0
-    """Clusters longer than this along x or y are left out."""
+    """Clusters longer than this along x or y are dropped."""
 
 
 @config_class
@@ -338,6 +338,6 @@ class VehicleConfig:
     objective_softness: Scalar = 0.1
     """See ``objective_gate``."""
     min_score: Scalar = 1e-4
-    """Boxes that score less are left out. Where you act, cut at `DEFAULT_SCORE_THRESHOLD`."""
+    """Boxes with lower scores are dropped. Where you act, cut at `DEFAULT_SCORE_THRESHOLD`."""
     max_overlap: Scalar = 0.1
     """Of two boxes with a larger bird's-eye view IoU, the lower-scoring is suppressed."""

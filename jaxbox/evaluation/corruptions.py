@@ -28,7 +28,7 @@ BACKSCATTER_SHARE = 0.3
 """Of the beams that fog takes, the share that come back from the fog itself."""
 
 MIN_RANGE_M = 2.0
-"""No spurious return is nearer: an HDL-64E reports none nearer than 0.9 m, and the carrier is left out."""
+"""No spurious return is nearer: an HDL-64E reports none nearer than 0.9 m, and the carrier is excluded."""
 
 SWEEP_PERIOD_S = 0.1
 """Of one turn."""

@@ -157,7 +157,7 @@ def evaluate(
       min_overlap: for each class to evaluate, the overlap that a match must exceed.
       metrics: some of `METRICS`.
       drives: the drive of each frame, to evaluate each drive by itself too. Frames of one drive are
-        correlated, so the number of drives says more about a figure's worth than that of frames.
+        correlated, so the number of drives says more about a figure's reliability than that of frames.
 
     Returns:
       A curve for each class, metric and difficulty. A class without labels or without detections has

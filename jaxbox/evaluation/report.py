@@ -51,7 +51,7 @@ def read_folders(
     """Reads the labels of a folder of sweeps and a folder of KITTI result files for them.
 
     Args:
-      root: what `jaxbox.io.open_sweeps` takes; sweeps without labels are left out.
+      root: what `jaxbox.io.open_sweeps` takes; sweeps without labels are skipped.
       results: folder of ``NAME.txt`` or ``data/NAME.txt``, one a labelled sweep.
       missing_as_empty: take a missing result file for an empty one.
 
@@ -202,7 +202,7 @@ def evaluate_objects(
       labels: ground truth of each frame, by name.
       results: detections, each with a score, of each of these frames.
       num_points: (labels of the frame,) int for each frame: LiDAR points within each label's box. Without
-        them, selections by points are left out.
+        them, selections by points are skipped.
       selections: what counts, by name.
       match_overlap: bird's-eye IoU from which sizes and directions are compared.
       drives: the drive of each frame, to report each by itself too.

@@ -68,7 +68,7 @@ def dimension_errors(estimated: np.ndarray, true: np.ndarray) -> DimensionErrors
     if estimated.shape != true.shape:
         raise ValueError(f"{estimated.size} estimated dimensions for {true.size} true ones.")
     if not np.all(true > 0):
-        raise ValueError(f"a true dimension is {true.min()} m; it must be above 0. Mend the label.")
+        raise ValueError(f"a true dimension is {true.min()} m; it must be above 0. Fix the label.")
     if not len(true):
         return DimensionErrors(0, *[None] * (len(dataclasses.fields(DimensionErrors)) - 1))
     residual, iou = estimated - true, dimension_iou(estimated, true)

@@ -66,7 +66,7 @@ def _unpacked_block(data: Data, start: int, metadata_bytes: int) -> int:
 
 
 def _field(data: Data, table: int, number: int) -> int:
-    """Where a table's field lies, or 0 where it is left out."""
+    """Where a table's field lies, or 0 where it is absent."""
     vtable = table - _integer(data, "<i", table)
     place = 4 + 2 * number
     if place >= _integer(data, "<H", vtable):

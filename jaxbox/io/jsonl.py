@@ -23,7 +23,7 @@ def detections_record(
     Args:
       name: of the sweep.
       detections: of one sweep, not a batch.
-      min_score: boxes that score less are left out.
+      min_score: boxes with lower scores are not written.
       timestamp_ns: when the sweep was taken, ns since 1970; None where it is unknown.
 
     Returns:

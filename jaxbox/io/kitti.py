@@ -125,7 +125,7 @@ def _parse_object(fields: list[str], where: str) -> KittiObject:
     elif len(fields) not in _OBJECT_COLUMNS:
         raise InputError(
             f"{where}: {len(fields)} columns; KITTI labels have 15, results 16, tracking labels 17 and "
-            "tracking results 18. Mend or remove the line."
+            "tracking results 18. Fix or remove the line."
         )
     numbers = [finite_number(text, name, where) for text, name in zip(fields[1:], _FIELDS[1:], strict=False)]
     return KittiObject(
@@ -257,8 +257,8 @@ def objects_from_detections(
     Args:
       detections: of one sweep, not a batch.
       calibration: the camera whose image the 2D boxes are in.
-      min_score: lower scores are left out.
-      min_visible_fraction: boxes with a smaller part of their 2D box in the image are left out; 0 keeps
+      min_score: boxes with lower scores are not written.
+      min_visible_fraction: boxes with a smaller part of their 2D box in the image are dropped; 0 keeps
         every box that the image touches.
 
     Returns:

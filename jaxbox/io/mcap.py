@@ -135,7 +135,7 @@ def _count_messages(reader: McapFile, others: set[str]) -> tuple[dict[str, int],
 
 
 def _decoder_of(schema: Any, channel: Any) -> Callable[[bytes, str], RecordedPoints] | None:
-    """What decodes the messages of a channel; None where they are no points."""
+    """What decodes the messages of a channel; None where they hold something else than points."""
     name = None if schema is None else schema.name
     if name in MESSAGE_TYPES and channel.message_encoding in _ROS_ENCODINGS:
         is_ros1 = channel.message_encoding == "ros1"

@@ -28,7 +28,7 @@ class SweepResult:
     xyz: np.ndarray | None = None
     """(n, 3) float32, m, sensor frame; None leaves the points out."""
     intensity: np.ndarray | None = None
-    """(n,) float32; None where the points are left out."""
+    """(n,) float32; None where the points are not written."""
     calibration: Calibration | None = None
     """Of the camera; None where there is none."""
     image: np.ndarray | None = None

@@ -132,7 +132,7 @@ def assemble(
     vertical = np.array([_vertical(winner, found, config) for winner in winners]).reshape(-1, 2)
     component, point_detection = (np.full(len(found.sweep.xyz), NO_CLUSTER) for _ in range(2))
     component[obstacles.row], point_detection[obstacles.row] = found.maps[0].component, owner
-    # NaN, the height of points that are left out, is on no side.
+    # NaN, the height of points that do not count, compares False.
     ground_mask = ground.height <= config.ground.min_height_m
     counts = _count_points(found, config) | {
         "ground_points": int(ground_mask.sum()),

@@ -32,7 +32,7 @@ def find_clusters(obstacles: Obstacles, component_map: ComponentMap, config: Det
       config: of the detector.
 
     Returns:
-      The clusters; those that the map has no room for are left out, and counted.
+      The clusters; those beyond the capacity of the map are dropped, and counted.
     """
     height, clustering = obstacles.height, config.clustering
     member = (height > component_map.min_height_m) & (height < component_map.max_height_m)
@@ -155,8 +155,8 @@ def select_clusters(
     Args:
       xy: (n, 2) m, true, not compressed.
       component: (n,) int, from 0.
-      config: components with fewer points, or longer along x or y, are left out.
-      min_extent_m: components whose extents along x and y have a shorter diagonal are left out.
+      config: components with fewer points, or longer along x or y, are dropped.
+      min_extent_m: components whose extents along x and y have a shorter diagonal are dropped.
 
     Returns:
       (n,) int: cluster of each point in the order of the components, `NO_CLUSTER` where it has none;

@@ -202,7 +202,7 @@ def longer_side(rectangle: Rectangle) -> Assignment:
 
 
 def fits(sides: Assignment, prior: ClassPrior) -> bool:
-    """Whether the measured sides are no longer than those of the class."""
+    """Whether the measured sides fit into the largest vehicle of the class."""
     length, width = sides.measured
     return bool(length <= prior.max_length_m and width <= prior.max_width_m)
 
@@ -308,10 +308,10 @@ def point_agreement(boxes: np.ndarray, xy: np.ndarray, config: CompletionConfig)
         inside[row] = np.mean((np.abs(local) < half + INSIDE_MARGIN_M).all(axis=1))
         distance = np.full(len(xy), np.inf)
         for axis in range(2):
-            beside = np.abs(local[:, 1 - axis]) < half[1 - axis] + FACE_OVERHANG_M
+            facing = np.abs(local[:, 1 - axis]) < half[1 - axis] + FACE_OVERHANG_M
             if abs(sensor[axis]) > half[axis]:
                 face = half[axis] if sensor[axis] > 0 else -half[axis]
-                to_face = np.where(beside, np.abs(local[:, axis] - face), np.inf)
+                to_face = np.where(facing, np.abs(local[:, axis] - face), np.inf)
                 distance = np.minimum(distance, to_face)
         near[row] = np.mean(NEAR_M / np.maximum(distance, NEAR_M))
     return float(config.inside_weight) * inside + float(config.near_weight) * near

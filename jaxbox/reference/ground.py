@@ -19,7 +19,7 @@ NARROW_WEIGHT = 0.02
 POOL_CELLS = 2
 """The grid is smoothed on squares of that many cells, and is theirs."""
 WIDE_POOL_CELLS = 8
-"""So many for the wide Gaussian."""
+"""The wide Gaussian works on squares of that many cells."""
 TRUNCATE = 3.0
 """The Gaussians end at this many standard deviations."""
 MIN_PLANE_POINTS = 3
@@ -61,7 +61,7 @@ def gather_obstacles(sweep: Sweep, ground: Ground, config: DetectorConfig) -> Ob
     Returns:
       The points, in sweep order.
     """
-    # NaN, the height of points that are left out, is not between.
+    # NaN, the height of points that do not count, compares False.
     between = (ground.height > config.ground.min_height_m) & (ground.height < config.ground.max_height_m)
     rows = np.flatnonzero(sweep.inlier & between)
     return index_obstacles(sweep.xyz, ground.height, rows, max_obstacles=config.clustering.max_obstacles)

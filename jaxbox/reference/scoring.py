@@ -20,11 +20,11 @@ from jaxbox.reference.state import (
 )
 
 PSEUDO_COUNT = 5
-"""So many upper points, with the share of the full score behind the faces, are added."""
+"""Pseudo-count: upper points that are added, with the share of the full score behind the faces."""
 NUM_LEVELS = 20
-"""Levels of height by which the top is found,"""
+"""Levels of height by which the top is found."""
 LOWEST_LEVEL = 0.4
-"""from this share of the highest that points of the vehicle may have."""
+"""Where the levels begin, as a share of the highest that points of the vehicle may have."""
 
 
 def score_boxes(

@@ -19,7 +19,7 @@ def detect_batch(
     key: jax.Array | None = None,
     devices: Sequence[Any] | None = None,
 ) -> list[Detections]:
-    """Finds the vehicles of many sweeps, over several devices at once.
+    """Finds the vehicles of many sweeps, over several devices in parallel.
 
     The devices take turns, and each runs `detect` as for a single sweep: the same program, so the same bits
     (on a CPU), and no more compiles than one a device and capacity. An accelerator is not filled by single

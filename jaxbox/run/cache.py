@@ -118,7 +118,7 @@ def keep_compiled(folder: pathlib.Path) -> None:
     if jax.config.values["jax_compilation_cache_dir"] in (None, *_chosen_here):
         jax.config.update("jax_compilation_cache_dir", str(folder))
         _chosen_here.add(str(folder))
-        # What JAX compiled before has settled for it that there is no cache.
+        # JAX decides at its first compilation whether there is a cache, and remembers it.
         compilation_cache.reset_cache()
 
 

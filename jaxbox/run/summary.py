@@ -182,7 +182,7 @@ def summarise(
     Args:
       detections: of one sweep: of a batch, take one row by `jax.tree.map` first.
       config: the settings that `detect` had, which say how large each capacity is; None for the default.
-      min_score: boxes that score less are left out.
+      min_score: boxes with lower scores are not listed.
 
     Returns:
       The summary; its `to_dict` is for JSON.

@@ -22,7 +22,7 @@ SEEN_RAMP = 0.05
 
 
 CERTAIN = 1e3
-"""Objective of a box that was not held against evidence: it passes any gate on the objective."""
+"""Objective of a box that no evidence weighs: it passes any gate on the objective."""
 
 
 @jax.tree_util.register_dataclass
@@ -67,7 +67,7 @@ def assign_length_axis(rectangle: Rectangles, side: jax.Array) -> Assignments:
 
 
 def fits(sides: Assignments, prior: ClassPrior) -> jax.Array:
-    """(...) bool: whether the measured sides are no longer than those of the class."""
+    """(...) bool: whether the measured sides fit into the largest vehicle of the class."""
     length, width = sides.measured
     return (length <= prior.max_length_m) & (width <= prior.max_width_m)
 
@@ -132,8 +132,7 @@ def keep_measured(sides: Assignments, prior: ClassPrior) -> Boxes:
     Returns:
       Boxes (...); no box where a measured side is too long.
     """
-    certain = jnp.where(fits(sides, prior), jnp.float32(CERTAIN), NOT_A_BOX)
-    return place(sides, sides.measured, jnp.zeros_like(certain, jnp.int32), certain)
+    return _place_unweighed(sides, sides.measured, prior)
 
 
 def extend_away(sides: Assignments, prior: ClassPrior, config: CompletionConfig) -> Boxes:
@@ -149,9 +148,13 @@ def extend_away(sides: Assignments, prior: ClassPrior, config: CompletionConfig)
     Returns:
       Boxes (...); no box where a measured side is too long.
     """
-    certain = jnp.where(fits(sides, prior), jnp.float32(CERTAIN), NOT_A_BOX)
-    sizes = likely_sizes(sides, prior, config)
-    return place(sides, sizes, jnp.zeros_like(certain, jnp.int32), certain)
+    return _place_unweighed(sides, likely_sizes(sides, prior, config), prior)
+
+
+def _place_unweighed(sides: Assignments, sizes: tuple[jax.Array, jax.Array], prior: ClassPrior) -> Boxes:
+    """Boxes of a size, away from the sensor, that no evidence weighs: each that fits its class is certain."""
+    objective = jnp.where(fits(sides, prior), jnp.float32(CERTAIN), NOT_A_BOX)
+    return place(sides, sizes, jnp.zeros_like(objective, jnp.int32), objective)
 
 
 def place(

@@ -1,7 +1,6 @@
 """Clustering by grid subdivision: connected components as proposals (paper, section 3.2, Algorithm II)."""
 
 import dataclasses
-import itertools
 import math
 
 import chex
@@ -10,12 +9,12 @@ import jax.numpy as jnp
 
 from jaxbox.config import BoxConfig, ClusteringConfig, DetectorConfig, RegionConfig, VehicleConfig
 from jaxbox.stages.state import Clusters, Obstacles
-from jaxbox.xla.barriers import materialize, single_kernel
 from jaxbox.xla.components import NONE, CellGrids, label_components
 from jaxbox.xla.loops import map_rows
 from jaxbox.xla.maps import flag_cells, map_tables
-from jaxbox.xla.rows import compact, lookup, lookup_pair, pack_pairs, prefix_sum, take
-from jaxbox.xla.segments import reduce_segments
+from jaxbox.xla.rows import compact, lookup_pair, pack_pairs, take
+from jaxbox.xla.segments import reduce_segments, segment_minima
+from jaxbox.xla.sorting import compact_groups
 
 
 def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Clusters:
@@ -261,14 +260,12 @@ def select_clusters(
     Args:
       statistics: of the C components.
       first: (maps + 1,) int32: first component of each map, and one past the last.
-      config: capacities of the maps, beyond which clusters are left out, and the gates on points and extent.
+      config: capacities of the maps, beyond which clusters are dropped, and the gates on points and extent.
       min_extent_m: least diagonal of the extents along x and y, m: no rectangle has a longer side.
 
     Returns:
       The clusters, in the order of the components.
     """
-    max_clusters = [m.max_clusters for m in config.maps]
-    capacity = sum(max_clusters)
     upper, num_points = statistics.upper, statistics.num_points
     component = jnp.arange(num_points.shape[0], dtype=jnp.int32)
     enough = num_points.astype(jnp.float32) >= jnp.maximum(config.min_points, 1.0)
@@ -276,29 +273,14 @@ def select_clusters(
     extent_x, extent_y = upper[:, 0] + upper[:, 3], upper[:, 1] + upper[:, 4]
     keep = keep & (jnp.maximum(extent_x, extent_y) <= config.max_extent_m)
     keep = keep & (extent_x**2 + extent_y**2 >= min_extent_m**2)
-    keep, order = materialize((keep, prefix_sum(keep)))
-
-    def count() -> tuple[list[jax.Array], jax.Array, list[jax.Array], list[jax.Array]]:
-        end = [lookup(order, first[i] - 1) for i in range(len(max_clusters) + 1)]
-        found = [after - before for before, after in itertools.pairwise(end)]
-        kept = [jnp.minimum(each, size) for each, size in zip(found, max_clusters, strict=True)]
-        return end, jnp.stack(found), kept, list(itertools.accumulate(kept))
-
-    end, found, kept, kept_up_to = single_kernel(count)
-    # The lists of the maps join without gaps.
-    row = jnp.full_like(order, capacity)
-    for i, size in enumerate(max_clusters):
-        place = order - end[i]
-        listed = keep & (place > 0) & (place <= size)
-        row = jnp.where(listed, place - 1 + kept_up_to[i] - kept[i], row)
-    member = jnp.full(capacity, num_points.shape[0], jnp.int32).at[row].set(component, mode="drop")
+    listed = compact_groups(keep, first, [m.max_clusters for m in config.maps])
 
     def describe(member: jax.Array) -> tuple[jax.Array, ...]:
         bounds = take(upper, member)
         return take(num_points, member), take(statistics.num_slab, member), -bounds[:, 3:6], bounds[:, :3]
 
-    rows = map_rows(describe, member, num_rows=kept_up_to[-1])
-    return ChosenComponents(row, *rows, found=found, kept=jnp.stack(kept))
+    rows = map_rows(describe, listed.member, num_rows=listed.num)
+    return ChosenComponents(listed.row, *rows, found=listed.found, kept=listed.kept)
 
 
 def _find_clusters(
@@ -323,6 +305,24 @@ def _find_clusters(
         prepare=lambda height: _in_slab(height, config),
         columns=obstacles.height,
     )
+
+
+def lowest_z(z: jax.Array, obstacles: Obstacles, clusters: Clusters) -> jax.Array:
+    """z of the lowest point of each cluster.
+
+    Args:
+      z: (N,) float32, m, of the sweep.
+      obstacles: O of its points.
+      clusters: of those.
+
+    Returns:
+      (P,) float32, m; 0 where a cluster has no point.
+    """
+    num_maps, num_clusters = clusters.of_point.shape[0], clusters.num_points.shape[0]
+    of_point = jnp.tile(take(z, obstacles.row), num_maps)
+    cluster = clusters.of_point.reshape(-1)
+    lowest = segment_minima(of_point, cluster, cluster < num_clusters, num_segments=num_clusters)
+    return jnp.where(jnp.isfinite(lowest), lowest, 0)
 
 
 def _in_slab(height: jax.Array, config: BoxConfig) -> jax.Array:

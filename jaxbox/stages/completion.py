@@ -249,7 +249,7 @@ def _largest_first(
             for rectangle, is_new in zip((first, *others), new, strict=True)
             for side in sides
         ]
-        missing = points.max_points - jnp.minimum(take(points.total, cluster), points.max_points)
+        missing = points.max_points - points.count_of(cluster)
         return jnp.where(jnp.stack(possible, axis=1), missing[:, None], points.max_points)
 
     ranks = map_rows(rank, (hypotheses.cluster, hypotheses.label), num_rows=hypotheses.num)

@@ -11,17 +11,8 @@ from jaxbox.config import EvidenceConfig
 from jaxbox.stages.state import Boxes, Evidence, FlatBoxes, Ground, RayFractions, Sweep
 from jaxbox.xla import chunks
 from jaxbox.xla.arithmetic import arctan2, cos_sin
-from jaxbox.xla.barriers import materialize
-from jaxbox.xla.loops import fast_axis, map_rows
-from jaxbox.xla.range_bits import (
-    BLOCK,
-    count_changes,
-    covered_words,
-    next_set,
-    next_words,
-    set_before,
-    words_at,
-)
+from jaxbox.xla.loops import apply_in_turn, fast_axis, map_rows
+from jaxbox.xla.range_bits import draw_beams, next_set, set_before, words_at
 from jaxbox.xla.rows import lookup
 
 SUPPORT_HALF_M = 100.0
@@ -45,11 +36,19 @@ DEEP_BEYOND_M = 0.1
 
 
 MIN_ENTRY_M = 1.0
-"""Rays that enter a box nearer than this say nothing: the sensor is all but inside."""
+"""Rays that enter a box nearer than this are ignored: the sensor is almost inside it."""
+
+
+MIN_DROP_M = 1e-3
+"""Beams that sink by less than this on their way are level, and cross no height."""
+
+
+ENDS_AT_RETURN = 1 - 1e-6
+"""From this fraction of its way on, the free part of a beam ends at the return itself."""
 
 
 MIN_SLOPE = 1e-9
-"""Rays along a face are taken to run away from it by this."""
+"""Least slope of a ray against a face: a ray along it lies wholly within the slab, or wholly outside."""
 
 
 def observe(sweep: Sweep, ground: Ground, config: EvidenceConfig) -> Evidence | None:
@@ -94,34 +93,29 @@ def build_evidence(
     num_azimuths, num_ranges, range_cell_m = config.num_azimuths, config.num_ranges, config.range_cell_m
     rho = jnp.sqrt(xyz[:, 0] ** 2 + xyz[:, 1] ** 2)
     returned = mask & (rho >= config.min_range_m)
-    azimuth = materialize(azimuth_cell(arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths))
-    num_blocks = num_ranges // BLOCK + 1
-    size = num_blocks * BLOCK * num_azimuths
-
-    def place(valid: jax.Array, range_cell: jax.Array) -> jax.Array:
-        return jnp.where(valid, range_cell * num_azimuths + azimuth, size)
-
     is_hit = returned & (config.hit_min_height_m < height) & (height < config.hit_max_height_m)
     is_hit = is_hit & (rho < num_ranges * range_cell_m)
-    hit_range = (rho / range_cell_m).astype(jnp.int32)
-    hits = jnp.zeros(size, bool).at[place(is_hit, hit_range)].set(True, mode="drop")
 
     drop = height - sensor_height_m
-    downward = returned & (drop < -1e-3)
+    downward = returned & (drop < -MIN_DROP_M)
     drop = jnp.where(downward, drop, -1.0)
     enter = jnp.maximum((config.free_max_height_m - sensor_height_m) / drop, 0)
     leave = jnp.minimum((config.free_min_height_m - sensor_height_m) / drop, 1)
     first_m = rho * enter
-    last_m = rho * leave - jnp.where(leave >= 1 - 1e-6, config.end_gap_m, 0)
+    last_m = rho * leave - jnp.where(leave >= ENDS_AT_RETURN, config.end_gap_m, 0)
     first = jnp.minimum((first_m / range_cell_m).astype(jnp.int32) + 1, num_ranges)
     last = jnp.minimum((last_m / range_cell_m).astype(jnp.int32), num_ranges)
     is_free = downward & (last_m > first_m) & (last > first)
-    beams = count_changes(size, place(is_free, first), place(is_free, last))
-
-    shape = (num_blocks, BLOCK, num_azimuths)
+    free, hit = draw_beams(
+        azimuth_cell(arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths),
+        (is_hit, (rho / range_cell_m).astype(jnp.int32)),
+        (is_free, first, last),
+        num_columns=num_azimuths,
+        num_cells=num_ranges,
+    )
     return Evidence(
-        free=covered_words(beams.reshape(shape)),
-        hit=next_words(hits.reshape(shape)),
+        free=free,
+        hit=hit,
         support=_ground_support(xyz, height, mask, config.support_height_m),
         num_ranges=num_ranges,
     )
@@ -194,7 +188,7 @@ def ground_support(evidence: Evidence, xy: jax.Array) -> jax.Array:
 
 
 def cast_rays(evidence: Evidence, boxes: FlatBoxes, config: EvidenceConfig, *, num_rays: int) -> RayFractions:
-    """Casts rays evenly over the azimuths that a box spans, and sorts them by what they met.
+    """Casts rays evenly over the azimuths that a box spans, and classifies them by what they met.
 
     A ray enters the box at e and leaves it at x. It hits where there is a return about e; else it is
     free where free space lies between; else deep where there is a return up to x; else occluded.
@@ -213,10 +207,15 @@ def cast_rays(evidence: Evidence, boxes: FlatBoxes, config: EvidenceConfig, *, n
     center, shape = boxes.center.reshape(-1, 2), boxes.center.shape[:-1]
     sides = (jnp.broadcast_to(a, shape).reshape(-1) for a in (boxes.length, boxes.width, boxes.yaw))
     length, width, yaw = sides
-    fan = materialize(_ray_fan(center, length / 2, width / 2, yaw))
     axis = fast_axis()
-    azimuth, enter, leave = materialize(_ray_stretches(fan, num_rays, axis))
-    met = materialize(_sort_rays(evidence, azimuth, enter, leave, config.range_cell_m))
+    met = apply_in_turn(
+        [
+            lambda boxes: _ray_fan(*boxes),
+            lambda fan: _ray_intervals(fan, num_rays, axis),
+            lambda intervals: _classify_rays(evidence, *intervals, range_cell_m=config.range_cell_m),
+        ],
+        (center, length / 2, width / 2, yaw),
+    )
     # Counts of rays in float32, which are exact.
     sums = (jnp.sum(a, axis=axis, dtype=jnp.float32).reshape(shape) for a in met)
     hit, free, deep, crosses, free_cells, cells = sums
@@ -272,7 +271,7 @@ def _ray_fan(center: jax.Array, half_l: jax.Array, half_w: jax.Array, yaw: jax.A
     return azimuth, (high - low) / 2, along, across, u, v, half_l, half_w
 
 
-def _ray_stretches(fan: Fan, num_rays: int, axis: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _ray_intervals(fan: Fan, num_rays: int, axis: int) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Azimuth of rays over boxes, and the ranges at which they enter and leave, the rays along an axis.
 
     In the box's frame, with the sensor at the origin, the box is |u - u0| < l / 2 and |v - v0| < w / 2: the
@@ -289,23 +288,22 @@ def _ray_stretches(fan: Fan, num_rays: int, axis: int) -> tuple[jax.Array, jax.A
 
 
 def _slab(middle: jax.Array, direction: jax.Array, half: jax.Array) -> tuple[jax.Array, jax.Array]:
-    # A ray along the face: any tiny slope has it wholly within, or wholly outside, the slab.
     inverse = 1 / jnp.where(jnp.abs(direction) > MIN_SLOPE, direction, MIN_SLOPE)
     through, reach = middle * inverse, half * jnp.abs(inverse)
     return through - reach, through + reach
 
 
-def _sort_rays(
+def _classify_rays(
     evidence: Evidence,
     azimuth: jax.Array,
     enter: jax.Array,
     leave: jax.Array,
     range_cell_m: float,
 ) -> tuple[jax.Array, ...]:
-    """Whether each ray hit, was free, was deep, crossed at all; its free cells inside, and all there."""
+    """Whether each ray is a hit, free, deep, and crosses the box; its free cells and all its cells inside."""
     num_azimuths = evidence.free.shape[1]
     crosses = (leave > enter) & (enter >= MIN_ENTRY_M)
-    # Any range will do where the ray misses.
+    # Where the ray misses, any valid range.
     enter, leave = jnp.where(crosses, enter, MIN_ENTRY_M), jnp.where(crosses, leave, MIN_ENTRY_M)
 
     def cell(range_m: jax.Array, extra: int) -> jax.Array:

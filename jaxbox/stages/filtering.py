@@ -7,14 +7,13 @@ import jax.numpy as jnp
 from jaxbox.config import FilterConfig, RegionConfig
 from jaxbox.stages.state import Sweep
 from jaxbox.types import PointCloud
-from jaxbox.xla.barriers import materialize
-from jaxbox.xla.chunks import FILTER_BLOCK_CELLS
-from jaxbox.xla.grids import map_cells, window_sums
-from jaxbox.xla.rows import masked_mean, masked_std
+from jaxbox.xla import chunks
+from jaxbox.xla.grids import map_cells, sum_cells, window_sums
+from jaxbox.xla.rows import keep_rows, masked_mean, masked_std
 
 MAX_ABS_Z_M = 100.0
-"""Points farther above or below the sensor are faults: one alone would stretch the spread of the whole
-sweep, by which outliers are told, and beyond 1e19 m its square overflows."""
+"""Points farther above or below the sensor are errors of measurement: one alone would inflate the
+deviation by which outliers are found, and beyond 1e19 m its square overflows."""
 
 
 MIN_DENSITY = 1e-6
@@ -33,7 +32,7 @@ def select_points(cloud: PointCloud, config: FilterConfig, region: RegionConfig)
       The points, and what each of them is.
     """
     chex.assert_shape([cloud.xyz1, cloud.num_points], [(None, 4), ()])
-    xyz1, is_point, finite, in_region = materialize(_in_region(jnp.asarray(cloud.xyz1), region))
+    xyz1, is_point, finite, in_region = _in_region(jnp.asarray(cloud.xyz1), region)
     inlier = filter_outliers(xyz1, config, region) if config.enabled else in_region
     return Sweep(xyz1, jnp.asarray(cloud.num_points), is_point, finite, in_region, inlier)
 
@@ -45,7 +44,7 @@ def _in_region(xyz1: jax.Array, region: RegionConfig) -> tuple[jax.Array, ...]:
     for axis, limit in enumerate((region.half_x_m, region.half_y_m, MAX_ABS_Z_M)):
         finite &= jnp.isfinite(xyz1[:, axis])
         valid &= jnp.abs(xyz1[:, axis]) < limit
-    return jnp.where(valid[:, None], xyz1, 0), is_point, finite, valid
+    return keep_rows(xyz1, valid), is_point, finite, valid
 
 
 def filter_outliers(xyz1: jax.Array, config: FilterConfig, region: RegionConfig) -> jax.Array:
@@ -72,7 +71,7 @@ def filter_outliers(xyz1: jax.Array, config: FilterConfig, region: RegionConfig)
     # A line of cells along y for each x and level, with an empty cell before and some after it. Between the
     # lines of two x lies an empty one, which is margin to both.
     stride, margin = num_levels + 1, num_levels + 2
-    width = -(-(num_y + 2) // FILTER_BLOCK_CELLS) * FILTER_BLOCK_CELLS
+    width = -(-(num_y + 2) // chunks.FILTER_BLOCK_CELLS) * chunks.FILTER_BLOCK_CELLS
 
     def cell_of(points: jax.Array) -> jax.Array:
         x, y, z = (
@@ -82,10 +81,8 @@ def filter_outliers(xyz1: jax.Array, config: FilterConfig, region: RegionConfig)
         return ((x * stride + z + margin) * width + y + 1).astype(jnp.uint32)
 
     valid = xyz1[:, 3] > 0
-    cells = materialize(cell_of(xyz1))
-    # One scatter for the sums and the counts: a point is what is added.
-    num_cells = (num_x * stride + 2 * margin) * width
-    sums = jnp.zeros((num_cells, 4), jnp.float32).at[cells].add(xyz1, mode="promise_in_bounds")
+    # One sum for the places and the counts: a point ends with 1.
+    cells, sums = sum_cells(cell_of, xyz1, num_cells=(num_x * stride + 2 * margin) * width)
     weight = jnp.exp(-0.5 * (cell_m / jnp.asarray(config.bandwidth_m, jnp.float32)) ** 2)
     windows = window_sums(sums.reshape(-1, 4 * width), stride, weight)
 

@@ -64,7 +64,7 @@ def remove_ground(sweep: Sweep, config: GroundConfig, key: jax.Array) -> Ground:
     plane, planes = fit_ground_planes(candidates, valid, key, config)
     surface = None
     if config.surface:
-        surface = fit_ground_surface(sweep.xyz, sweep.inlier, plane.coefficients, config)
+        surface = fit_ground_surface(sweep.xyz, sweep.inlier, planes, config)
     height = height_above_ground(sweep.xyz, planes, surface, config)
     return Ground(plane, planes, surface, height)
 
@@ -78,7 +78,7 @@ def gather_obstacles(sweep: Sweep, ground: Ground, config: DetectorConfig) -> Ob
       config: of the detector: the heights, and the capacity O.
 
     Returns:
-      The points, in the sweep's order; those beyond the capacity are left out, and counted.
+      The points, in the sweep's order; those beyond the capacity are dropped, and counted.
     """
     chex.assert_shape([sweep.inlier, ground.height], sweep.xyz.shape[:1])
     low_m, high_m = config.ground.min_height_m, config.ground.max_height_m
@@ -106,6 +106,25 @@ def height_above_ground(
     if surface is None:
         return height
     return height - surface_height(surface, xyz[:, :2], config)
+
+
+def ground_elevation(
+    xyz: jax.Array, planes: jax.Array, surface: jax.Array | None, config: GroundConfig
+) -> jax.Array:
+    """z of the ground under points: of the planes, and the ground grid over them.
+
+    Args:
+      xyz: (N, 3) float32, m; z only matters with several planes.
+      planes: (rounds, 3) float32.
+      surface: (G, G) float32, m, or None.
+      config: of the ground.
+
+    Returns:
+      (N,) float32, m.
+
+    Reference: oracle `jaxbox.reference.ground_elevation`.
+    """
+    return xyz[:, 2] - height_above_ground(xyz, planes, surface, config)
 
 
 def cell_minima(xyz: jax.Array, mask: jax.Array, config: GroundConfig) -> tuple[jax.Array, jax.Array]:
@@ -163,7 +182,7 @@ def spread_points(
 def fit_ground_plane(
     candidates: jax.Array, mask: jax.Array, key: jax.Array, config: GroundConfig, *, round_index: int = 0
 ) -> GroundPlane:
-    """The plane with the most support: RANSAC, all hypotheses at once, then refits on all inliers.
+    """The plane with the most support: RANSAC, all hypotheses in parallel, then refits on all inliers.
 
     A hypothesis is the plane z = a x + b y + c through three random candidates; its support is the
     number of candidates within the tolerance of it. Planes steeper than the gate have none.
@@ -261,61 +280,61 @@ def _is_level(plane: jax.Array, max_grade: jax.Array) -> jax.Array:
     return jnp.hypot(plane[0], plane[1]) <= max_grade
 
 
-def fit_ground_surface(xyz: jax.Array, mask: jax.Array, plane: jax.Array, config: GroundConfig) -> jax.Array:
-    """Height of the ground over the plane, on a grid, where the road is not flat.
+def fit_ground_surface(xyz: jax.Array, mask: jax.Array, planes: jax.Array, config: GroundConfig) -> jax.Array:
+    """Height of the ground over the planes, on a grid, where the road is not flat.
 
-    The lowest residual of each cell, where it lies near the plane, is ground if no ground cell near by
+    The lowest height of each cell, where it lies near a plane, is ground if no ground cell near by
     is so much lower that the slope between would pass the limit; the rest is filled by Gaussians, on
     squares of cells.
 
     Args:
       xyz: (N, 3) float32, m.
       mask: (N,) bool, points that count.
-      plane: (3,) float32.
-      config: the grid, the band round the plane, the slope limit and the Gaussian.
+      planes: (rounds, 3) float32; with several, a point is held against the one under it.
+      config: the grid, the band round a plane, the slope limit and the Gaussian.
 
     Returns:
-      (G, G) float32, m: height of the ground over the plane at the centres of squares of 2 x 2 cells.
+      (G, G) float32, m: height of the ground over the planes at the centres of squares of 2 x 2 cells.
 
     Reference: oracle `jaxbox.reference.fit_ground_surface`.
     """
     cell_m, half_m = config.surface_cell_m, config.surface_half_m
     n = round(2 * half_m / cell_m)
-    residual = plane_residual(xyz, plane)
+    height = height_above_planes(xyz, planes, tolerance_m=config.min_height_m)
     rho = jnp.sqrt(xyz[:, 0] ** 2 + xyz[:, 1] ** 2)
-    near_plane = (residual > -config.band_below_m - config.band_below_grade * rho) & (
-        residual < config.band_above_m + config.band_above_grade * rho
+    near_plane = (height > -config.band_below_m - config.band_below_grade * rho) & (
+        height < config.band_above_m + config.band_above_grade * rho
     )
     i, j = (jnp.floor((xyz[:, axis] + half_m) / cell_m).astype(jnp.int32) for axis in (0, 1))
     inside = (i >= 0) & (i < n) & (j >= 0) & (j < n)
     cell = jnp.where(mask & near_plane & inside & (rho > config.blind_radius_m), i * n + j, n * n)
-    lowest = jnp.full(n * n, jnp.inf, jnp.float32).at[cell].min(residual, mode="drop").reshape(n, n)
+    lowest = jnp.full(n * n, jnp.inf, jnp.float32).at[cell].min(height, mode="drop").reshape(n, n)
     envelope = _lower_envelope(lowest, config.max_grade * cell_m, config.num_envelope_rounds)
     ground = jnp.isfinite(lowest) & (lowest < envelope + config.envelope_margin_m)
     return _smooth(jnp.where(ground, lowest, 0), ground.astype(jnp.float32), config.smoothing_m / cell_m)
 
 
 def _lower_envelope(lowest: jax.Array, step_m: jax.Array | float, num_rounds: int) -> jax.Array:
-    """The highest surface below the cells that rises by at most `step_m` a cell, near each cell."""
+    """The highest surface below the cells that rises by at most `step_m` from cell to cell."""
 
     def spread(jump: int, envelope: jax.Array) -> jax.Array:
         size = envelope.shape[0] - 2 * jump
         at = [
             [envelope[i : i + size, j : j + size] for j in (0, jump, 2 * jump)] for i in (0, jump, 2 * jump)
         ]
-        beside = jnp.minimum(jnp.minimum(at[0][1], at[2][1]), jnp.minimum(at[1][0], at[1][2]))
-        across = jnp.minimum(jnp.minimum(at[0][0], at[0][2]), jnp.minimum(at[2][0], at[2][2]))
+        straight = jnp.minimum(jnp.minimum(at[0][1], at[2][1]), jnp.minimum(at[1][0], at[1][2]))
+        diagonal = jnp.minimum(jnp.minimum(at[0][0], at[0][2]), jnp.minimum(at[2][0], at[2][2]))
         rise = jump * step_m
-        return jnp.minimum(at[1][1], jnp.minimum(beside + rise, across + math.sqrt(2) * rise))
+        return jnp.minimum(at[1][1], jnp.minimum(straight + rise, diagonal + math.sqrt(2) * rise))
 
-    # The margin wears off jump by jump. No way between two cells is shorter for leading through it.
+    # Each jump cuts off part of the margin. No shortest path between two cells leads through it.
     envelope = jnp.pad(lowest, num_rounds, constant_values=jnp.inf)
     jumps = [functools.partial(spread, jump) for jump in _jumps(num_rounds)]
     return apply_in_turn(jumps, envelope)
 
 
 def _jumps(num_rounds: int) -> list[int]:
-    """Jumps straight or across that lead wherever as many single steps do, at the same cost.
+    """Straight or diagonal jumps that reach all cells that as many single steps reach, at the same cost.
 
     >>> _jumps(10)
     [1, 1, 2, 2, 4]
@@ -327,7 +346,7 @@ def _jumps(num_rounds: int) -> list[int]:
 
 
 def _smooth(height: jax.Array, weight: jax.Array, sigma_cells: jax.Array | float) -> jax.Array:
-    """Weighted Gaussian mean of the heights, filled from one so much wider, on pooled cells."""
+    """Weighted Gaussian mean of the heights on pooled cells, filled by a wider one where cells are empty."""
     grids = [_pool(grid, POOL_CELLS) for grid in (height, weight)]
     ratio = WIDE_POOL_CELLS // POOL_CELLS
     near, near_weight = _blur(grids, sigma_cells / POOL_CELLS)
@@ -379,7 +398,7 @@ def _enlarge(grid: jax.Array, size: int, ratio: int) -> jax.Array:
 
 
 def surface_height(surface: jax.Array, xy: jax.Array, config: GroundConfig) -> jax.Array:
-    """Height of the ground grid over the plane, bilinear between the centres of its squares.
+    """Height of the ground grid over the planes, bilinear between the centres of its squares.
 
     Args:
       surface: (G, G) float32, m.

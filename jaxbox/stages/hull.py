@@ -9,11 +9,10 @@ from jaxbox.config.capacities import slab_capacity
 from jaxbox.stages.state import Clusters, Kept, Obstacles, Outlines, Owners
 from jaxbox.types import Hulls
 from jaxbox.xla import chunks
-from jaxbox.xla.barriers import materialize
 from jaxbox.xla.hulls import lower_hulls
 from jaxbox.xla.loops import fold_rows, map_rows
 from jaxbox.xla.ragged import PointLists, list_points
-from jaxbox.xla.rows import compact, lookup, take
+from jaxbox.xla.rows import compact, lookup_each, take
 from jaxbox.xla.segments import argmax_key, argmax_row
 
 MIN_EXTENT_M = 1e-6
@@ -98,8 +97,9 @@ def trace_hulls(
     """
 
     def trace(index: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        x, y = materialize([jnp.take(xy[:, axis], index, mode="clip") for axis in (0, 1)])
-        return convex_hulls(x, y, index < xy.shape[0], max_vertices=config.max_vertices)
+        valid = index < xy.shape[0]
+        x, y = lookup_each((xy[:, 0], xy[:, 1]), jnp.minimum(index, xy.shape[0] - 1))
+        return convex_hulls(x, y, valid, max_vertices=config.max_vertices)
 
     return map_rows(trace, index, num_rows=num_clusters, chunk=chunks.HULLS, axis=-1)
 
@@ -168,7 +168,7 @@ def extreme_points(
     """The points of each cluster that can reach its hull: the extremes of thin slices.
 
     The cluster's bounding box is cut into slices along x, and along y; each slice keeps its two extreme
-    points across. A point left out lies between two kept ones of its slice, so the hull of the kept
+    points across. A dropped point lies between two kept ones of its slice, so the hull of the kept
     points is nowhere farther than one slice's width from the true hull, plus a rounding of at most
     extent / 2^11 for sweeps of up to a million points.
 
@@ -240,7 +240,7 @@ def convex_hulls(
     """
     size = valid.shape[1]
     x = jnp.where(valid, x, jnp.nan)
-    chain_x, chain_y, count = lower_hulls(*materialize([_both_ways(x), _both_ways(y)]))
+    chain_x, chain_y, count = lower_hulls(_both_ways(x), _both_ways(y))
     has_points = count[:size] > 0
     # A chain that ends where the other begins leaves that point to it.
     end = jnp.maximum(count - 1, 0), jnp.arange(2 * size, dtype=jnp.int32)
@@ -253,8 +253,7 @@ def convex_hulls(
     pick = jnp.where(num > max_vertices, j * num // max_vertices, jnp.maximum(jnp.minimum(j, num - 1), 0))
     is_lower = pick < num_lower
     place = jnp.where(is_lower, pick, pick - num_lower), jnp.where(is_lower, column, column + size)
-    place = materialize(place)
-    x, y = materialize([lookup(chain, *place) for chain in (chain_x, chain_y)])
+    x, y = lookup_each((chain_x, chain_y), *place)
     return jnp.where(is_lower, x, -x), jnp.where(is_lower, y, -y), num[0]
 
 

@@ -18,7 +18,7 @@ from jaxbox.stages.state import (
     Candidates,
     Clusters,
     Completed,
-    HeightAboveGround,
+    GroundElevation,
     Kept,
     Obstacles,
     RayFractions,
@@ -51,8 +51,8 @@ LOWEST_LEVEL = 0.4
 
 
 PSEUDO_COUNT = 5
-"""Pseudo-count: upper points that are added, with the share of the full score behind the faces: of few points
-the share says little."""
+"""Upper points that are added before the share behind the faces is taken, at the share of the full score, so
+that a few points cannot give an extreme share."""
 
 
 INSIDE_TOLERANCE_M = 1e-3
@@ -103,7 +103,8 @@ def score_boxes(
     rays: tuple[RayFractions, jax.Array] | None,
     clusters: Clusters,
     obstacles: Obstacles,
-    height_above_ground: HeightAboveGround,
+    ground_elevation: GroundElevation,
+    lowest_z: jax.Array | None,
     config: DetectorConfig,
 ) -> Candidates:
     """Scores the boxes by rays and size, then the best of them by what surrounds them.
@@ -113,7 +114,9 @@ def score_boxes(
       rays: what the rays over each box met, and the ground support round it; None without evidence.
       clusters: of P rows.
       obstacles: all points above the ground.
-      height_above_ground: asks for heights.
+      ground_elevation: asks for the ground under points.
+      lowest_z: (P,) float32, m, of each cluster's points: it tells which of several planes a vehicle stands
+        on; None with one plane.
       config: of the detector.
 
     Returns:
@@ -136,7 +139,10 @@ def score_boxes(
     around = _look_around(rectangle, label, cluster, num, clusters, obstacles, config)
 
     def finish(rows: tuple[Any, ...]) -> Candidates:
-        return _finish(rows, clusters, height_above_ground, settings)
+        candidates = _finish(rows, clusters, settings)
+        z = jnp.zeros_like(candidates.bottom) if lowest_z is None else take(lowest_z, candidates.cluster)
+        place = jnp.concatenate([candidates.rectangle[:, :2], z[:, None]], axis=1)
+        return dataclasses.replace(candidates, bottom=candidates.bottom + ground_elevation(place))
 
     candidates = map_rows(finish, (*picked, around), num_rows=num)
     order = best_first(candidates.score, num)
@@ -181,7 +187,7 @@ def _look_around(
     obstacles: Obstacles,
     config: DetectorConfig,
 ) -> NeighbourhoodCounts:
-    """What there is in and round each box: its cluster alone where the preset does not look round."""
+    """Counts of the points in and round each box; of its cluster alone where the preset asks for no more."""
     if not config.vehicles.neighbourhood:
         num_points = take(clusters.num_points, cluster).astype(jnp.float32)
         return cluster_alone(num_points, take(clusters.high[:, 2], cluster))
@@ -189,24 +195,17 @@ def _look_around(
     return count_points_around(rectangle, prior, num, obstacles, config.vehicles, config.region)
 
 
-def _finish(
-    rows: tuple[Any, ...],
-    clusters: Clusters,
-    height_above_ground: HeightAboveGround,
-    config: VehicleConfig,
-) -> Candidates:
-    """Candidates with their score and height, in the order that they came in."""
+def _finish(rows: tuple[Any, ...], clusters: Clusters, config: VehicleConfig) -> Candidates:
+    """Candidates with their score and height, bottoms above the ground, in the order that they came in."""
     rectangle, label, cluster, score, around = rows
     prior = prior_of(config.classes, label)
     late = neighbourhood_score(around, jnp.linalg.norm(rectangle[:, :2], axis=1), prior, config)
     height = jnp.maximum(around.top + config.top_margin_m, prior.min_box_height_m)
-    above = jnp.zeros_like(height)
+    bottom = jnp.zeros_like(height)
     if not config.neighbourhood:
         # The paper keeps the height of the cluster itself.
-        above = take(clusters.low[:, 2], cluster)
-        height = take(clusters.high[:, 2], cluster) - above
-    at_sensor_height = jnp.concatenate([rectangle[:, :2], jnp.zeros_like(rectangle[:, :1])], axis=1)
-    bottom = above - height_above_ground(at_sensor_height)
+        bottom = take(clusters.low[:, 2], cluster)
+        height = take(clusters.high[:, 2], cluster) - bottom
     total = score * late
     total = jnp.where(total > config.min_score, total, 0)
     return Candidates(rectangle, bottom, height, total, label, cluster, total > 0, jnp.zeros_like(label))
@@ -220,7 +219,7 @@ def keep_best(candidates: Candidates, config: VehicleConfig) -> Kept:
       config: the overlap, and the capacity K.
 
     Returns:
-      K rows; the lowest-scoring beyond the capacity are left out, and counted.
+      K rows; the lowest-scoring beyond the capacity are dropped, and counted.
     """
     chex.assert_shape(candidates.rectangle, (*candidates.valid.shape, 5))
     keep = non_max_suppression(candidates.rectangle, candidates.valid, max_overlap=config.max_overlap)
@@ -319,7 +318,7 @@ def cluster_alone(num_points: jax.Array, top: jax.Array) -> NeighbourhoodCounts:
 
 
 def _frames(boxes: jax.Array, count_max_height_m: jax.Array, recess_m: jax.Array) -> jax.Array:
-    """(P, 11) what the points round a box are held against, see `_judge`."""
+    """(P, 11) the frames that points round a box are compared in, see `_judge`."""
     x, y, length, width, yaw = boxes.T
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     half_l, half_w = length / 2, width / 2

@@ -224,11 +224,11 @@ class CastRays(Protocol):
         ...
 
 
-class HeightAboveGround(Protocol):
-    """Asks for heights above the ground: `jaxbox.stages.ground.height_above_ground` of one sweep."""
+class GroundElevation(Protocol):
+    """Asks where the ground is: `jaxbox.stages.ground.ground_elevation` of one sweep."""
 
     def __call__(self, xyz: jax.Array) -> jax.Array:
-        """(N,) m, of points (N, 3) m."""
+        """(N,) m, z of the ground under points (N, 3) m."""
         ...
 
 

@@ -298,7 +298,7 @@ def draw_clutter(
     rows: "Sequence[ClutterRow] | None" = None,
     reach_m: tuple[float, float] = (-50.0, 85.0),
 ) -> list[tuple[Thing, np.ndarray]]:
-    """Rows of clutter on both sides of the road, left out where something stands.
+    """Rows of clutter on both sides of the road, except where something stands.
 
     Args:
       rng: draws them.

@@ -66,10 +66,10 @@ class Solid:
         leave = np.where(speed > 0, crossing, np.inf).min(axis=1)
         face = entering.argmax(axis=1)
         enter = np.take_along_axis(entering, face[:, None], axis=1)[:, 0]
-        beside = ((speed == 0) & (gap < 0)).any(axis=1)
+        parallel_outside = ((speed == 0) & (gap < 0)).any(axis=1)
         material = self.materials[face]
         through = (material == Material.GLASS) & (draw > 1 - GLASS_TRANSMITTED)
-        hit = (enter > 0) & (enter < leave) & ~beside & ~through
+        hit = (enter > 0) & (enter < leave) & ~parallel_outside & ~through
         return np.where(hit, enter, np.inf), material, self.normals[face]
 
     def placed(self, linear: np.ndarray, offset: np.ndarray) -> "Solid":

@@ -40,7 +40,7 @@ class Road:
         return np.cos(self.heading) * y - np.sin(self.heading) * x - self.center_offset_m
 
     def along(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Distance along the road from beside the sensor, m."""
+        """Distance along the road from the sensor, m."""
         return np.cos(self.heading) * x + np.sin(self.heading) * y
 
 

@@ -1,4 +1,4 @@
-"""Choosing settings by labelled frames: what to try, what it scored, and what held on drives left out."""
+"""Choosing settings by labelled frames: what to try, what it scored, and what on held-out drives."""
 
 from jaxbox.tuning.report import make_report, markdown_report, report_sentences, report_tables
 from jaxbox.tuning.selection import HeldOut, Trial, best_trial, leave_one_out

@@ -110,7 +110,7 @@ def report_sentences(report: Mapping[str, Any]) -> list[str]:
         "chosen on the frames that it is scored on.",
     ]
     if held_out is None:
-        return [*lines, "Keep the base: with one group nothing can be left out, so the gain is unproven."]
+        return [*lines, "Keep the base: with one group nothing can be held out, so the gain is unproven."]
     spread = held_out["gain_spread"]
     lines.append(
         f"Held out {_mean(held_out)}: each group with the setting that the others chose, a gain of "
@@ -130,7 +130,7 @@ def report_sentences(report: Mapping[str, Any]) -> list[str]:
 
 
 def report_tables(report: Mapping[str, Any]) -> list[Table]:
-    """The figures: by copy, the settings, the best trials, and the groups left out.
+    """The figures: by copy, the settings, the best trials, and the held-out groups.
 
     Args:
       report: from `make_report`.
@@ -205,7 +205,7 @@ def _groups_table(report: Mapping[str, Any]) -> Table:
         ]
         for row in report["held_out"]["groups"]
     ]
-    title = "each group by itself, left out; the ceiling is what perfect answers reach"
+    title = "each group by itself, held out; the ceiling is what perfect answers reach"
     return title, ["group", "frames", "trial chosen without it", "base", "held out", "gain", "ceiling"], rows
 
 

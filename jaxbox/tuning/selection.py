@@ -1,8 +1,8 @@
-"""Which setting to take, and what taking it so is worth on drives that had no say in it.
+"""Which setting to take, and what it scores on drives that did not choose it.
 
 The best of many settings on the frames that chose it is flattered: some of its gain is luck. So for each
 drive the best setting on all other drives is taken, this drive's frames are scored with it, and all frames
-left out so are scored together.
+held out in this way are scored together.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ class Trial(Generic[Match]):
     changes: Mapping[str, float]
     """Thresholds that differ from the base, by dotted name."""
     blind: bool
-    """Whether it was proposed without a look at any label; only such ones may stand for a drive left out."""
+    """Whether it was proposed without a look at any label; only such ones may stand for a held-out drive."""
     matches: Sequence[Mapping[str, Match]]
     """For each copy, each frame."""
     scores: tuple[float, ...]
@@ -84,7 +84,7 @@ class HeldOut:
 
     @property
     def keep_base(self) -> bool:
-        """Whether the gain is no more than noise."""
+        """Whether the gain is within the noise."""
         return self.gain <= self.noise
 
 

@@ -31,7 +31,7 @@ class Bench:
     frames: Sequence[Frame]
     """The labelled sweeps."""
     groups: Mapping[str, str]
-    """The drive of each frame, or whatever is left out together."""
+    """The drive of each frame, or another group that is held out together."""
     copies: Sequence[Copy]
     """How the sweeps are turned."""
     objective: Objective

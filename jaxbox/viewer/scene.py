@@ -248,6 +248,6 @@ def _inside_any(xyz: np.ndarray, boxes: BoxSet) -> np.ndarray:
     for center, size, yaw in zip(boxes.center, boxes.size, boxes.yaw.tolist(), strict=True):
         x, y, z = (xyz - center).T
         along, across = np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x
-        beside = size[:2] / 2 + _LABEL_MARGIN_M
-        inside |= (abs(along) < beside[0]) & (abs(across) < beside[1]) & (abs(z) < size[2] / 2)
+        reach = size[:2] / 2 + _LABEL_MARGIN_M
+        inside |= (abs(along) < reach[0]) & (abs(across) < reach[1]) & (abs(z) < size[2] / 2)
     return inside

@@ -103,7 +103,7 @@ def _check_address(host: str, port: int) -> None:
 def _bind_error(family: int, address: Any) -> OSError | None:
     try:
         with socket.socket(family, socket.SOCK_STREAM) as probe:
-            # As servers do: an address is free again at once when its last server has ended.
+            # As servers do: an address can be reused as soon as its last server has ended.
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)
     except OSError as error:

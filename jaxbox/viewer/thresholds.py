@@ -100,7 +100,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         Threshold(
             name="ground.max_height_m",
             label="to height (m)",
-            hint="Points higher above the ground than this are overhead, and left out.",
+            hint="Points higher above the ground than this are overhead, and dropped.",
             low=1.0,
             high=8.0,
             step=0.1,
@@ -119,7 +119,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         Threshold(
             name="clustering.min_points",
             label="points from",
-            hint="Clusters with fewer points are left out.",
+            hint="Clusters with fewer points are dropped.",
             low=1.0,
             high=100.0,
             step=1.0,
@@ -127,7 +127,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         Threshold(
             name="clustering.max_extent_m",
             label="extent to (m)",
-            hint="Clusters longer than this along x or y are left out.",
+            hint="Clusters longer than this along x or y are dropped.",
             low=2.0,
             high=30.0,
             step=0.5,
@@ -191,7 +191,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         Threshold(
             name="vehicles.min_score",
             label="score from",
-            hint="Boxes that score less are left out of the answer.",
+            hint="Boxes with lower scores are dropped.",
             low=0.0,
             high=1.0,
             step=0.01,

@@ -167,7 +167,7 @@ def picture(image: np.ndarray) -> str:
     """
     _, encoded = cv2.imencode(".jpg", image[..., ::-1], (cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY))
     data = base64.b64encode(encoded.tobytes()).decode()
-    # Decoded at once, or the panel would be empty for a moment between two images.
+    # Decoded synchronously, or the panel would be empty for a moment between two images.
     return f"<img alt='camera' decoding='sync' style='width: 100%' src='data:image/jpeg;base64,{data}'>"
 
 

@@ -70,7 +70,7 @@ def draw_bird_eye(
     `jaxbox.viz.verdict.group_boxes`.
 
     Args:
-      xyz: (n, 3) real numbers, m, sensor frame; not finite points are left out.
+      xyz: (n, 3) real numbers, m, sensor frame; points that are not finite are not drawn.
       colors: (n, 3) uint8; None colours by height over the road of the KITTI car.
       boxes: estimates.
       truth: true boxes.

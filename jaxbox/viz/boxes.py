@@ -59,7 +59,7 @@ class BoxSet:
 
         Args:
           detections: the answer for one sweep, unbatched.
-          min_score: lower-scoring boxes are left out.
+          min_score: boxes with lower scores are not drawn.
 
         Returns:
           At most K boxes.

@@ -29,7 +29,7 @@ def draw_points(picture: np.ndarray, uv: np.ndarray, colors: np.ndarray, *, dot_
 
     Args:
       picture: (h, w, 3) uint8, changed.
-      uv: (n, 2) real numbers, px: column, row; points outside or not finite are left out.
+      uv: (n, 2) real numbers, px: column, row; points outside or not finite are not drawn.
       colors: (n, 3) uint8.
       dot_px: edge of a dot.
     """

@@ -48,7 +48,7 @@ def color_by_height(height: np.ndarray, *, low_m: float = LOW_M, high_m: float =
     """
     share = (np.asarray(height, np.float64) - low_m) / (high_m - low_m)
     level = (255 * np.clip(np.nan_to_num(share), 0.0, 1.0)).astype(np.uint8)
-    # The ends of the scale are too dark on a dark ground, so they are left out.
+    # The ends of the scale are too dark on a dark ground, so they are not used.
     level = (20 + level.astype(np.int64) * 215 // 255).astype(np.uint8)
     scale = cv2.applyColorMap(np.arange(256, dtype=np.uint8).reshape(-1, 1), cv2.COLORMAP_TURBO)
     return np.ascontiguousarray(scale[:, 0, ::-1])[level]

@@ -95,7 +95,7 @@ def group_by_verdict(
       labels: the frame's labels, those that the scene was made of.
       results: likewise its detections.
       calibration: of the camera that was labelled.
-      min_score: lower-scored detections are left out, and find nothing.
+      min_score: detections with lower scores are not drawn, and match nothing.
 
     Returns:
       All groups, some of them empty, in the order in which they are drawn.

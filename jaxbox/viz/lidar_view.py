@@ -68,7 +68,7 @@ def draw_lidar_view(
     """Draws a sweep and 3D boxes in perspective; edges are cut in front of the camera.
 
     Args:
-      xyz: (n, 3) real numbers, m, sensor frame; not finite points are left out.
+      xyz: (n, 3) real numbers, m, sensor frame; points that are not finite are not drawn.
       colors: (n, 3) uint8; None colours by height over the road of the KITTI car.
       boxes: estimates.
       truth: true boxes.

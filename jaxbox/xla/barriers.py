@@ -35,6 +35,20 @@ def materialize(values: Any) -> Any:
     return jax.lax.while_loop(lambda state: state[0], turn, (never, values))[1]
 
 
+def opaque_zeros(*shape: int) -> jax.Array:
+    """Zeros that the compiler does not know to be zeros. Law: `jnp.zeros`.
+
+    A function that is called with them, and again with other numbers, is compiled once and not twice.
+
+    Args:
+      *shape: static.
+
+    Returns:
+      float32 zeros.
+    """
+    return materialize(jnp.zeros(shape, jnp.float32))
+
+
 def outline(function: Callable[..., Any], *operands: Any) -> Any:
     """Calls a function in a room of its own: its scratch memory lives while it runs, and no longer.
 

@@ -1,5 +1,8 @@
 """Truth values as the bits of words."""
 
+import functools
+from collections.abc import Sequence
+
 import jax
 import jax.numpy as jnp
 
@@ -7,8 +10,27 @@ WORD_BITS = 32
 """Bits of a word of a set of flags."""
 
 
+def join_bits(flags: Sequence[jax.Array]) -> jax.Array:
+    """Joins up to 32 arrays of truth values to words. Law: bit k of each word is ``flags[k]``.
+
+    Unlike `pack_bits` it is computed within whatever reads the words, without the flags being stored.
+
+    Args:
+      flags: (...) bool or uint8, 0 or 1, each.
+
+    Returns:
+      (...) uint32.
+
+    >>> join_bits([jnp.array([True, False]), jnp.array([True, True])]).tolist()
+    [3, 2]
+    """
+    return functools.reduce(jnp.bitwise_or, [_bit(flag, jnp.uint32(k)) for k, flag in enumerate(flags)])
+
+
 def pack_bits(flags: jax.Array, *, axis: int = -1) -> jax.Array:
     """Packs truth values along an axis. Law: bit b of word w is flag 32 w + b.
+
+    A sum, which is computed once for all that read the words; `join_bits` would be computed in each of them.
 
     Args:
       flags: (..., N, ...) bool or uint8, 0 or 1.
@@ -24,9 +46,13 @@ def pack_bits(flags: jax.Array, *, axis: int = -1) -> jax.Array:
     before, size, after = flags.shape[:axis], flags.shape[axis], flags.shape[axis + 1 :]
     if size % WORD_BITS:
         flags = jnp.pad(flags, [(0, -size % WORD_BITS) if a == axis else (0, 0) for a in range(flags.ndim)])
-    bits = flags.reshape(*before, -1, WORD_BITS, *after).astype(jnp.uint32)
     place = jnp.arange(WORD_BITS, dtype=jnp.uint32).reshape(*[1] * (axis + 1), WORD_BITS, *[1] * len(after))
-    return jnp.sum(bits << place, axis=axis + 1, dtype=jnp.uint32)
+    bits = _bit(flags.reshape(*before, -1, WORD_BITS, *after), place)
+    return jnp.sum(bits, axis=axis + 1, dtype=jnp.uint32)
+
+
+def _bit(flags: jax.Array, place: jax.Array) -> jax.Array:
+    return flags.astype(jnp.uint32) << place
 
 
 def count_bits(words: jax.Array) -> jax.Array:

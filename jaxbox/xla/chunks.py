@@ -2,8 +2,9 @@
 
 None of them changes a result. A chunk is large enough for wide vectors and few turns of a loop, and small
 enough for its scratch memory to stay in the cache; with one row at a time XLA compiles a loop to native code.
-They were chosen by timing real sweeps (``python -m benchmarks.bench_stages``); what came of it is in
-docs/notes/kernels_on_cpu.md, unless another place is named.
+``python -m benchmarks.bench_chunks NAME`` times a size against its half and its double on real sweeps, in the
+step that it names; for sizes that it does not vary it names what chose them. What came of it is in
+docs/notes/kernels_on_cpu.md, and for accelerators in docs/notes/accelerators.md.
 """
 
 FILTER_BLOCKS = 1024
@@ -51,13 +52,10 @@ RUN_ROWS = 32
 """Neighbouring rows of a run in one block of `jaxbox.xla.runs`; a count of 6 bits holds 63."""
 
 RUN_BLOCKS, RUN_BLOCKS_ON_ACCELERATOR = 1024, 8192
-"""Such blocks looked at in one go (the second: docs/notes/accelerators.md)."""
+"""Such blocks looked at in one go."""
 
 RANKS = 16
 """Rows that all others are compared with in one step."""
-
-OVERLAP_TILE = 32
-"""Rows and columns of the matrix of overlaps at a time: the bits of a word, and no other number."""
 
 OWNERS = 4096
 """Points whose detections are looked up at a time."""
@@ -70,7 +68,7 @@ UNROLLED = 4, 3, 2, 1
 its own. Four are twice as fast as one."""
 
 SUM_BLOCK = 512
-"""Columns of sums in two levels, on an accelerator (docs/notes/accelerators.md)."""
+"""Columns of sums in two levels, on an accelerator."""
 
 SINGLE_KERNEL_NUMBERS = 62
 """Numbers that `jaxbox.xla.barriers.single_kernel` may copy: what reads and writes more than a kilobyte is no

@@ -307,7 +307,7 @@ def _join_sequential(row: CellGrids, runs: _Runs) -> jax.Array:
 
 
 def _join_in_rounds(row: CellGrids, runs: _Runs) -> jax.Array:
-    """As `_join_sequential`, all links at once.
+    """As `_join_sequential`, all links in parallel.
 
     The first kind of link makes a forest; its trees hook onto lower ones over the others.
     """

@@ -9,8 +9,28 @@ import jax.numpy as jnp
 
 from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.barriers import materialize
 from jaxbox.xla.loops import for_chunks
 from jaxbox.xla.rows import compact
+
+
+def sum_cells(
+    cell_of: Callable[[jax.Array], jax.Array], rows: jax.Array, *, num_cells: int
+) -> tuple[jax.Array, jax.Array]:
+    """Sums rows by cell. Law: ``cell_of(rows)``, and `jax.ops.segment_sum` by those.
+
+    Args:
+      cell_of: maps rows (N, C) to their cells, (N,) uint32, below `num_cells`.
+      rows: (N, C) float32.
+      num_cells: static.
+
+    Returns:
+      cells: (N,) uint32, stored once for the sum and for whatever reads them next.
+      sums: (num_cells, C) float32.
+    """
+    cells = materialize(cell_of(rows))
+    zeros = jnp.zeros((num_cells, rows.shape[1]), rows.dtype)
+    return cells, zeros.at[cells].add(rows, mode="promise_in_bounds")
 
 
 def map_cells(

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.barriers import materialize
 
 
 def lower_hulls(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -24,6 +25,7 @@ def lower_hulls(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.A
     if on_accelerator():
         return _lower_hulls_parallel(x, y)
     far = jnp.inf
+    x, y = materialize((x, y))  # Each turn of the loop reads them.
 
     def step(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         i, _, chain_x, chain_y = state

@@ -154,8 +154,8 @@ def fold_rows(
     num_rows = jnp.minimum(num_rows, size)
 
     def fold(state: Any, index: jax.Array, rows: Any) -> Any:
-        there = index < num_rows
-        return update(state, index, jax.tree.map(lambda a, none: jnp.where(there, a, none), rows, absent))
+        valid = index < num_rows
+        return update(state, index, jax.tree.map(lambda a, none: jnp.where(valid, a, none), rows, absent))
 
     if on_accelerator():
         return fold(state, jnp.arange(size, dtype=jnp.int32), rows)

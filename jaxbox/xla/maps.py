@@ -38,7 +38,7 @@ def flag_cells(
       flags: (F,) uint8, 1 at `CellGrids.flag` of the cells.
     """
     size = jax.tree.leaves(columns)[0].shape[0]
-    num_rows = jnp.minimum(num_rows, size)  # What fills up the last chunk is no point.
+    num_rows = jnp.minimum(num_rows, size)  # The padding of the last chunk holds no points.
     chunk = _chunk_size(size)
     whole = whole_chunks(columns, chunk)
     whole_size = jax.tree.leaves(whole)[0].shape[0]

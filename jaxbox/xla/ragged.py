@@ -39,6 +39,10 @@ class PointLists:
         """(K,) int32, points of each cluster that are looked at."""
         return jnp.minimum(self.total, self.max_points)
 
+    def count_of(self, cluster: jax.Array) -> jax.Array:
+        """(C,) int32, the `count` of some clusters: (C,) int32, in [0, K]; the latter has none."""
+        return jnp.minimum(take(self.total, cluster), self.max_points)
+
     def table(self, cluster: jax.Array) -> PointTable:
         """The points of some clusters, spread evenly over all they have: every (total / M)-th.
 
@@ -59,7 +63,7 @@ class PointLists:
             # Stored, since what a look-up has to work out first does not vectorise.
             row = materialize(self._row(start[None], total[None], index[:, None]))
             x, y = (jnp.take(values, row, mode="clip") for values in (self.x, self.y))
-        return x, y, jnp.minimum(total, self.max_points)
+        return x, y, self.count_of(cluster)
 
     def _row(self, start: jax.Array, total: jax.Array, j: jax.Array) -> jax.Array:
         """The row of the j-th point that is looked at of each cluster."""
@@ -143,15 +147,15 @@ def fold_points(
     if on_accelerator():
         # Points along the last axis, which reductions read without transposing, see `PointLists.table`.
         of_point = jax.vmap(functools.partial(update, init), out_axes=-1)(x, y)
-        exists = jnp.arange(capacity, dtype=jnp.int32)[None] < count[:, None]
+        valid = jnp.arange(capacity, dtype=jnp.int32)[None] < count[:, None]
         return jax.tree.map(
-            lambda values, none: reduce(jnp.where(exists, values, none[..., None]), axis=-1), of_point, init
+            lambda values, none: reduce(jnp.where(valid, values, none[..., None]), axis=-1), of_point, init
         )
 
-    there, unroll = jnp.arange(capacity, dtype=jnp.int32)[:, None] < count[None], chunks.FOLDED_POINTS
+    valid, unroll = jnp.arange(capacity, dtype=jnp.int32)[:, None] < count[None], chunks.FOLDED_POINTS
 
     def fill(values: jax.Array, value: Any) -> jax.Array:
-        filled = jnp.where(there, values, value)
+        filled = jnp.where(valid, values, value)
         more = jnp.broadcast_to(jnp.asarray(value, values.dtype), (-capacity % unroll, values.shape[1]))
         return jnp.concatenate([filled, more])
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxbox.xla.backend import on_accelerator
 from jaxbox.xla.barriers import materialize
-from jaxbox.xla.bits import lowest_bit
+from jaxbox.xla.bits import count_bits, join_bits, lowest_bit
 from jaxbox.xla.rows import lookup
 
 BLOCK_BITS = 4
@@ -28,7 +28,7 @@ def count_changes(size: int, first: jax.Array, last: jax.Array) -> jax.Array:
 
     Args:
       size: static, number of cells.
-      first: (N,) int32 cells; those beyond the last are left out.
+      first: (N,) int32 cells; those beyond the last are ignored.
       last: (N,) int32, likewise.
 
     Returns:
@@ -41,6 +41,43 @@ def count_changes(size: int, first: jax.Array, last: jax.Array) -> jax.Array:
     return beams.at[ends[0]].add(1, mode="drop").at[ends[1]].add(-1, mode="drop")
 
 
+def draw_beams(
+    column: jax.Array,
+    hit: tuple[jax.Array, jax.Array],
+    free: tuple[jax.Array, jax.Array, jax.Array],
+    *,
+    num_columns: int,
+    num_cells: int,
+) -> tuple[jax.Array, jax.Array]:
+    """Draws beams into a polar grid, each into one column.
+
+    Law: `covered_words` of ``first <= cell < last`` of any beam, and `next_words` of the cells that are hit.
+
+    Args:
+      column: (N,) int32, of each beam; it is stored once for the three scatters that read it.
+      hit: (N,) bool, whether a beam hits a cell, and (N,) int32, that cell, in [0, num_cells).
+      free: (N,) bool, whether a beam is free anywhere, and (N,) int32 twice, the first cell where it is and
+        the first beyond, in [0, num_cells].
+      num_columns: static, A.
+      num_cells: static, R; B blocks cover them and one more.
+
+    Returns:
+      free: (B, A) uint32, see `covered_words`.
+      hit: (B, A) uint32, see `next_words`.
+    """
+    num_blocks = num_cells // BLOCK + 1
+    shape, size = (num_blocks, BLOCK, num_columns), num_blocks * BLOCK * num_columns
+    column = materialize(column)
+
+    def place(valid: jax.Array, cell: jax.Array) -> jax.Array:
+        return jnp.where(valid, cell * num_columns + column, size)
+
+    is_free, first, last = free
+    hits = jnp.zeros(size, bool).at[place(*hit)].set(True, mode="drop")
+    beams = count_changes(size, place(is_free, first), place(is_free, last))
+    return covered_words(beams.reshape(shape)), next_words(hits.reshape(shape))
+
+
 def covered_words(beams: jax.Array) -> jax.Array:
     """Words of the cells that intervals cover. Law: bit k is ``cumsum(beams) > 0``; see `set_before`.
 
@@ -51,11 +88,12 @@ def covered_words(beams: jax.Array) -> jax.Array:
       (B, A) uint32: which cells of a block are covered, and, from bit 16 on, how many before the block.
     """
     running = _sum_before(functools.reduce(jnp.add, (beams[:, k] for k in range(BLOCK))))
-    free = jnp.zeros_like(running, jnp.uint32)
+    covered = []
     for k in range(BLOCK):
         running = running + beams[:, k]
-        free = free | ((running > 0).astype(jnp.uint32) << k)
-    before = _sum_before(jax.lax.population_count(free).astype(jnp.int32))
+        covered.append(running > 0)
+    free = join_bits(covered)
+    before = _sum_before(count_bits(free))
     return free | (before.astype(jnp.uint32) << BLOCK)
 
 
@@ -76,9 +114,7 @@ def next_words(hits: jax.Array) -> jax.Array:
       (B, A) uint32: which cells of a block are flagged, and, from bit 16 on, the first flagged cell beyond
       the block, or `NEVER`.
     """
-    hit = jnp.zeros((hits.shape[0], hits.shape[2]), jnp.uint32)
-    for k in range(BLOCK):
-        hit = hit | (hits[:, k].astype(jnp.uint32) << k)
+    hit = join_bits([hits[:, k] for k in range(BLOCK)])
     start = jnp.arange(hits.shape[0], dtype=jnp.uint32)[:, None] * BLOCK
     first = jnp.where(hit > 0, start + lowest_bit(hit), NEVER)
 
@@ -132,7 +168,7 @@ def set_before(words: jax.Array, cell: jax.Array) -> jax.Array:
       (...) int32.
     """
     below = (jnp.uint32(1) << (cell & (BLOCK - 1)).astype(jnp.uint32)) - 1
-    return ((words >> BLOCK) + jax.lax.population_count(words & below)).astype(jnp.int32)
+    return (words >> BLOCK).astype(jnp.int32) + count_bits(words & below)
 
 
 def words_at(tables: Sequence[jax.Array], cells: Sequence[jax.Array], column: jax.Array) -> list[jax.Array]:

@@ -5,7 +5,7 @@ scatters with ``mode="drop"`` ignore it.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -151,7 +151,7 @@ def compact(mask: jax.Array, capacity: int, *, num: jax.Array | None = None) -> 
 
     Args:
       mask: (N,) bool, or (M, N), whose rows are gone through one after the other.
-      capacity: static; entries beyond it are left out.
+      capacity: static; entries beyond it are dropped.
       num: () int32: no entry of a row is True beyond this many, which may be more than N.
         A CPU does not look at them.
 
@@ -210,6 +210,19 @@ def rows_in_use(present: jax.Array) -> jax.Array:
     return maximum(jnp.where(present, number, 0), 0)
 
 
+def keep_rows(rows: jax.Array, keep: jax.Array) -> jax.Array:
+    """Rows to keep, and zeros in place of the others. Law: ``jnp.where(keep[:, None], rows, 0)``.
+
+    Args:
+      rows: (N, C).
+      keep: (N,) bool.
+
+    Returns:
+      (N, C), stored once for all that read it.
+    """
+    return materialize(jnp.where(keep[:, None], rows, 0))
+
+
 def take(rows: jax.Array, index: jax.Array, fill: Any = 0) -> jax.Array:
     """Rows at the indices, and a fill at the sentinel or any beyond. Law: ``rows[i] if i < N else fill``.
 
@@ -243,6 +256,23 @@ def lookup(table: jax.Array, *index: jax.Array) -> jax.Array:
     for size, along in zip(table.shape[1:], index[1:], strict=True):
         flat = flat * size + along
     return jnp.take(table.reshape(-1), flat, mode="clip")
+
+
+def lookup_each(tables: Sequence[jax.Array], *index: jax.Array) -> list[jax.Array]:
+    """Looks up the same entries of several tables. Law: ``[table[index] for table in tables]``.
+
+    The indices are stored before the look-ups, and so is what those find: on a CPU what a look-up has to work
+    out first does not vectorise, nor does what comes of it.
+
+    Args:
+      tables: arrays of one shape, see `lookup`.
+      *index: int32 arrays of one shape, each within its axis.
+
+    Returns:
+      The shape of the indices, of each table.
+    """
+    index = materialize(index)
+    return materialize([lookup(table, *index) for table in tables])
 
 
 def pack_pairs(number: jax.Array, flag: jax.Array) -> jax.Array:

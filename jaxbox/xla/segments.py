@@ -54,7 +54,7 @@ def _reduce_sequential(
     table: jax.Array,
     is_maximum: np.ndarray,
 ) -> jax.Array:
-    """Row after row: XLA compiles so small a loop to native code, which adds all columns at once."""
+    """Row after row: XLA compiles so small a loop to native code, which adds a whole row at a time."""
 
     def add(maps: range, i: jax.Array, table: jax.Array) -> jax.Array:
         own = _as_row(describe(jax.tree.map(lambda a: a[i], rows)))
@@ -108,7 +108,7 @@ def segment_minima(
 
     Args:
       values: (N,) float32.
-      segment: (N,) int32; values beyond the last segment are left out.
+      segment: (N,) int32; values beyond the last segment are ignored.
       valid: (N,) bool, values that count.
       num_segments: static, S.
 

@@ -1,17 +1,18 @@
 """Rows by group and by score, at a fixed shape."""
 
-from collections.abc import Callable
-from typing import Any
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
-from jaxbox.xla.barriers import materialize
+from jaxbox.xla.barriers import materialize, single_kernel
 from jaxbox.xla.bits import WORD_BITS
 from jaxbox.xla.loops import for_chunks
-from jaxbox.xla.rows import compact, prefix_sum
+from jaxbox.xla.rows import compact, lookup, prefix_sum
 
 
 def largest_first(size: jax.Array, max_size: int) -> tuple[jax.Array, jax.Array]:
@@ -101,6 +102,54 @@ def _stable_order(group: jax.Array, num_groups: int) -> jax.Array:
     # One packed word sorts several times faster than a key with its value.
     packed = jax.lax.sort((group.astype(jnp.uint32) << index_bits) | index, is_stable=False)
     return (packed & (2**index_bits - 1)).astype(jnp.int32)
+
+
+class GroupedRows(NamedTuple):
+    """Rows of several groups in one list, group by group, without gaps."""
+
+    row: jax.Array
+    """(N,) int32: where each row is in the list, P where it is not."""
+    member: jax.Array
+    """(P,) int32: which row is there, N beyond the last."""
+    found: jax.Array
+    """(G,) int32: rows of each group, true number."""
+    kept: jax.Array
+    """(G,) int32: those in the list."""
+    num: jax.Array
+    """() int32: rows in the list."""
+
+
+def compact_groups(keep: jax.Array, first: jax.Array, capacities: Sequence[int]) -> GroupedRows:
+    """Lists the rows to keep, at a fixed capacity for each group. Law: `compact` of each group, joined.
+
+    Args:
+      keep: (N,) bool; none before the first group or after the last.
+      first: (G + 1,) int32: first row of each group, at least 1, and one past the last.
+      capacities: static, of the G groups; P in all.
+
+    Returns:
+      The list.
+
+    >>> listed = compact_groups(jnp.array([False, True, True, True]), jnp.array([1, 3, 4]), [1, 2])
+    >>> listed.row.tolist(), listed.member.tolist(), listed.found.tolist()
+    ([3, 0, 3, 1], [1, 3, 4], [2, 1])
+    """
+    keep, order = materialize((keep, prefix_sum(keep)))
+
+    def count() -> tuple[list[jax.Array], jax.Array, list[jax.Array], list[jax.Array]]:
+        end = [lookup(order, first[i] - 1) for i in range(len(capacities) + 1)]
+        found = [after - before for before, after in itertools.pairwise(end)]
+        kept = [jnp.minimum(each, capacity) for each, capacity in zip(found, capacities, strict=True)]
+        return end, jnp.stack(found), kept, list(itertools.accumulate(kept))
+
+    end, found, kept, kept_up_to = single_kernel(count)
+    row = jnp.full_like(order, sum(capacities))
+    for before, num, up_to in zip(end, kept, kept_up_to, strict=False):
+        place = order - before
+        row = jnp.where(keep & (place > 0) & (place <= num), place - 1 + up_to - num, row)
+    size, itself = keep.shape[0], jnp.arange(keep.shape[0], dtype=jnp.int32)
+    member = jnp.full(sum(capacities), size, jnp.int32).at[row].set(itself, mode="drop")
+    return GroupedRows(row, member, found, jnp.stack(kept), kept_up_to[-1])
 
 
 def select_highest(

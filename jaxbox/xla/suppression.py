@@ -6,10 +6,9 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
-from jaxbox.xla.bits import pack_bits
-from jaxbox.xla.loops import for_chunks
+from jaxbox.xla.bits import WORD_BITS, pack_bits
+from jaxbox.xla.loops import for_chunks, whole_chunks
 from jaxbox.xla.rows import count_true
 
 ROUNDS = 6
@@ -50,7 +49,7 @@ def suppress_conflicts(rows: jax.Array, valid: jax.Array, conflict: Conflict) ->
 
 
 def _suppress_parallel(rows: jax.Array, valid: jax.Array, conflict: Conflict) -> jax.Array:
-    """As `suppress_conflicts`, all pairs at once, and some rounds before the host looks whether they do."""
+    """As `suppress_conflicts`, all pairs in parallel, several rounds before each check for convergence."""
     row = jnp.arange(valid.shape[0], dtype=jnp.int32)
     rivals = _all_pairs(conflict, rows, rows) & (row[None] < row[:, None])
 
@@ -69,19 +68,21 @@ def _all_pairs(conflict: Conflict, first: jax.Array, second: jax.Array) -> jax.A
 
 
 def _rivals(rows: jax.Array, num_rows: jax.Array, conflict: Conflict) -> jax.Array:
-    """(P, P / 32) uint32: which earlier rows each one is in conflict with, as bits."""
-    tile = chunks.OVERLAP_TILE
-    rows = jnp.pad(rows, [(0, -rows.shape[0] % tile)] + [(0, 0)] * (rows.ndim - 1))
-    row = jnp.arange(tile, dtype=jnp.uint32)
+    """(P, P / 32) uint32: which earlier rows each one is in conflict with, as bits.
+
+    One word of each of 32 rows at a time, and only words of rows that come earlier.
+    """
+    rows = whole_chunks(rows, WORD_BITS)
+    row = jnp.arange(WORD_BITS, dtype=jnp.uint32)
 
     def fill(i: jax.Array, j: jax.Array, bits: jax.Array) -> jax.Array:
-        first, second = (jax.lax.dynamic_slice_in_dim(rows, k, tile) for k in (i, j))
+        first, second = (jax.lax.dynamic_slice_in_dim(rows, k, WORD_BITS) for k in (i, j))
         earlier = j + row[None] < i + row[:, None]
         new = pack_bits(_all_pairs(conflict, first, second) & earlier)
-        return jax.lax.dynamic_update_slice(bits, new, (i, j // tile))
+        return jax.lax.dynamic_update_slice(bits, new, (i, j // WORD_BITS))
 
     def fill_row(i: jax.Array, bits: jax.Array) -> jax.Array:
-        return for_chunks(i + 1, tile, functools.partial(fill, i), bits)
+        return for_chunks(i + 1, WORD_BITS, functools.partial(fill, i), bits)
 
-    bits = jnp.zeros((rows.shape[0], rows.shape[0] // tile), jnp.uint32)
-    return for_chunks(num_rows, tile, fill_row, bits)
+    bits = jnp.zeros((rows.shape[0], rows.shape[0] // WORD_BITS), jnp.uint32)
+    return for_chunks(num_rows, WORD_BITS, fill_row, bits)
