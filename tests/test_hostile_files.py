@@ -309,6 +309,7 @@ def test_pipes_devices_and_broken_links_are_refused_by_every_reader(tmp_path):
     for read in (
         io.read_labels, io.read_calibration, io.read_config, io.read_image, io.read_jsonl,
         io.read_argoverse2_boxes, io.read_pandaset_boxes, io.read_semantic_labels,
+        io.read_pose_file, io.read_oxts,
     ):  # fmt: skip
         with pytest.raises(io.InputError, match="no plain file"):
             read(tmp_path / "pipe")

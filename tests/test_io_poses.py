@@ -750,7 +750,7 @@ def test_nuscenes_poses_are_chained_over_its_tables(tmp_path):
         ),
         (
             lambda tables: tables["ego_pose"][1].update(translation=["a"] * 3),
-            "e1: no rotation of 4",
+            "e1: no translation of 3",
         ),
         (
             lambda tables: tables["ego_pose"][0].update(translation=[math.nan] * 3),

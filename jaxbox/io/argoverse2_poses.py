@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxbox._files import InputError
 from jaxbox.io.argoverse2 import log_sensor_xyz_m, read_table
-from jaxbox.io.pose_files import quaternion_pose
+from jaxbox.io.pose_files import rigid_from_quaternions
 from jaxbox.io.pose_track import PoseTrack, UnusableSource
 from jaxbox.io.sweep import Sweep
 
@@ -57,5 +57,5 @@ def _read_track(path: str) -> PoseTrack:
         raise InputError(f"{path}: it holds no pose.")
     wxyz = np.stack([table[name] for name in _ROTATION], axis=1)
     place = np.stack([table[name] for name in _POSITION], axis=1)
-    poses = [quaternion_pose(wxyz[row], place[row], f"{path}, row {row}") for row in range(len(wxyz))]
-    return PoseTrack.sorted(table[_TIME], np.array(poses))
+    poses = rigid_from_quaternions(wxyz, place, lambda row: f"{path}, row {row}")
+    return PoseTrack.sorted(table[_TIME], poses)

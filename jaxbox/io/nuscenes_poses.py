@@ -5,21 +5,24 @@ Those tables are lists of a gigabyte in the whole data set, so they are read one
 Reference: Caesar et al., "nuScenes: A multimodal dataset for autonomous driving", CVPR 2020.
 """
 
+import dataclasses
 import json
 import pathlib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from jaxbox._files import InputError, check_file, reason
-from jaxbox.io.pose_files import quaternion_pose
+from jaxbox.io.pose_files import rigid_from_quaternions
 from jaxbox.io.pose_track import UnusableSource
 from jaxbox.io.sweep import Sweep
 
 _PIECE_CHARACTERS = 2**20
 _MAX_RECORD_CHARACTERS = 2**20
 """Of one record; they have some hundred."""
+_FIELDS = (("rotation", 4), ("translation", 3))
+"""Of a pose, and their numbers."""
 _TABLES = ("sample_data.json", "calibrated_sensor.json", "ego_pose.json")
 
 
@@ -64,21 +67,36 @@ def _poses(version: pathlib.Path, data: Sequence[dict[str, Any]]) -> np.ndarray:
         found = _records(version / table, tokens, key=lambda record: str(record.get("token")))
         if absent := [token for token in tokens if token not in found]:
             raise InputError(f"{version / table}: no record {absent[0]}. Copy the tables again.")
-        poses = {token: _pose(record, f"{version / table}, {token}") for token, record in found.items()}
-        parts.append(np.array([poses[token] for token in tokens]))
+        wxyz, place = (_numbers(found, tokens, version / table, *field) for field in _FIELDS)
+        parts.append(rigid_from_quaternions(wxyz, place, _Where(version / table, tokens)))
     T_world_ego, T_ego_sensor = parts
     return T_world_ego @ T_ego_sensor
 
 
-def _pose(record: dict[str, Any], where: str) -> np.ndarray:
-    try:
-        wxyz = np.array(record["rotation"], np.float64).reshape(4)
-        translation = np.array(record["translation"], np.float64).reshape(3)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{where}: no rotation of 4 and translation of 3 numbers. Copy the table again."
-        ) from error
-    return quaternion_pose(wxyz, translation, where)
+@dataclasses.dataclass(frozen=True)
+class _Where:
+    """Table and record of a pose, for errors."""
+
+    path: pathlib.Path
+    tokens: Sequence[str]
+
+    def __call__(self, index: int) -> str:
+        return f"{self.path}, {self.tokens[index]}"
+
+
+def _numbers(
+    found: Mapping[str, dict[str, Any]], tokens: Sequence[str], path: pathlib.Path, name: str, count: int
+) -> np.ndarray:
+    """A field of several numbers of each of the records."""
+    rows = []
+    for token in tokens:
+        try:
+            rows.append(np.array(found[token][name], np.float64).reshape(count))
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{path}, {token}: no {name} of {count} numbers. Copy the table again."
+            ) from error
+    return np.array(rows)
 
 
 def _file_name(record: dict[str, Any]) -> str:

@@ -11,6 +11,7 @@ benchmark for the evaluation of RGB-D SLAM systems", IROS 2012.
 import dataclasses
 import enum
 import os
+from collections.abc import Callable
 
 import numpy as np
 
@@ -67,7 +68,7 @@ def read_pose_file(path: str | os.PathLike[str]) -> PoseFile:
       InputError: naming file and line, for another number of columns, a number that is not finite, or a pose
         that is no rigid transform; and for a file without poses.
     """
-    poses, times, columns = [], [], 0
+    rows, lines, columns = [], [], 0
     for number, line in enumerate(read_text(path).splitlines(), start=1):
         words = line.partition("#")[0].replace(",", " ").split()
         if not words:
@@ -79,66 +80,73 @@ def read_pose_file(path: str | os.PathLike[str]) -> PoseFile:
                 f"{where}: {len(words)} numbers; each line needs 12 (KITTI), 8 (TUM: time, position, "
                 "quaternion) or 16 (matrix), and all lines as many."
             )
-        values = np.array([finite_number(word, f"number {i}", where) for i, word in enumerate(words, 1)])
-        if columns == TUM_COLUMNS:
-            times.append(_time_ns(values[0], where))
-        poses.append(_tum_pose(values[1:], where) if columns == TUM_COLUMNS else _matrix_pose(values, where))
-    if not poses:
+        rows.append([finite_number(word, f"number {i}", where) for i, word in enumerate(words, 1)])
+        lines.append(where)
+    if not rows:
         raise InputError(f"{path}: it holds no pose.")
-    return PoseFile(np.array(poses), columns, np.array(times, np.int64) if times else None)
+    values = np.array(rows)
+    if columns == TUM_COLUMNS:
+        times = [_time_ns(value, where) for value, where in zip(values[:, 0], lines, strict=True)]
+        T = rigid_from_quaternions(np.roll(values[:, 4:], 1, axis=1), values[:, 1:4], lines.__getitem__)
+        return PoseFile(T, columns, np.array(times, np.int64))
+    if columns == KITTI_COLUMNS:
+        values = np.hstack([values, np.tile([0.0, 0.0, 0.0, 1.0], (len(values), 1))])
+    return PoseFile(rigid_or_error(values.reshape(-1, 4, 4), lines.__getitem__), columns, None)
 
 
-def rigid_or_error(T: np.ndarray, where: str) -> np.ndarray:
-    """A pose of a file, with an exact rotation.
+def rigid_or_error(T: np.ndarray, where: Callable[[int], str]) -> np.ndarray:
+    """The poses of a file, with exact rotations.
 
     Args:
-      T: (4, 4) real.
-      where: file and line, for the error.
+      T: (n, 4, 4) real.
+      where: file and line of a pose by its number, for the error.
 
     Returns:
-      (4, 4) float64.
+      (n, 4, 4) float64.
 
     Raises:
-      InputError: where it is no rigid transform, or is farther away than any place on earth.
+      InputError: for the first that is no rigid transform, or is farther away than any place on earth.
     """
-    problem = check_pose(T)
-    if problem is None and np.abs(T[:3, 3]).max() > _MAX_POSITION_M:
-        problem = f"its position is {np.abs(T[:3, 3]).max():.3g} m away"
-    if problem is not None:
-        raise InputError(f"{where}: no pose: {problem}. Correct or remove it.")
+    for index in np.flatnonzero(~_are_near_rigid(T)):
+        problem = check_pose(T[index]) or f"its position is {np.abs(T[index, :3, 3]).max():.3g} m away"
+        raise InputError(f"{where(int(index))}: no pose: {problem}. Correct or remove it.")
     return orthonormal_pose(T)
 
 
-def quaternion_pose(wxyz: np.ndarray, translation: np.ndarray, where: str) -> np.ndarray:
-    """A pose of a file that is given as a quaternion and a position.
+def _are_near_rigid(T: np.ndarray) -> np.ndarray:
+    """Which poses `check_pose` accepts and are on earth: all at once, as there may be a hundred a second."""
+    R = T[:, :3, :3]
+    # Numbers that are not finite, or whose squares are not, fail every comparison.
+    with np.errstate(over="ignore", invalid="ignore"):
+        is_rotation = np.abs(R.swapaxes(1, 2) @ R - np.eye(3)).max(axis=(1, 2)) <= ROTATION_TOLERANCE
+        is_row = np.abs(T[:, 3] - [0, 0, 0, 1]).max(axis=1) <= ROTATION_TOLERANCE
+        is_near = np.abs(T[:, :3, 3]).max(axis=1) <= _MAX_POSITION_M
+        return is_rotation & is_row & is_near & (np.linalg.det(R) > 0)
+
+
+def rigid_from_quaternions(
+    wxyz: np.ndarray, translation: np.ndarray, where: Callable[[int], str]
+) -> np.ndarray:
+    """The poses of a file that are given as quaternions and positions.
 
     Args:
-      wxyz: (4,) real, the real part first.
-      translation: (3,) real, m.
-      where: file and line, for the error.
+      wxyz: (n, 4) real, the real part first.
+      translation: (n, 3) real, m.
+      where: file and line of a pose by its number, for the error.
 
     Returns:
-      (4, 4) float64.
+      (n, 4, 4) float64.
 
     Raises:
-      InputError: where the quaternion's length is not 1, or a number is not finite.
+      InputError: for the first whose quaternion's length is not 1, or that has a number that is not finite.
     """
-    norm = float(np.linalg.norm(wxyz))
-    if not abs(norm - 1.0) <= ROTATION_TOLERANCE:
+    norm = np.linalg.norm(wxyz, axis=1)
+    for index in np.flatnonzero(~(np.abs(norm - 1.0) <= ROTATION_TOLERANCE)):
         raise InputError(
-            f"{where}: no pose: its quaternion has length {norm:.4g}, not 1. Correct or remove it."
+            f"{where(int(index))}: no pose: its quaternion has length {norm[index]:.4g}, not 1. "
+            "Correct or remove it."
         )
-    return rigid_or_error(rigid_from_quaternion(np.asarray(wxyz) / norm, translation), where)
-
-
-def _matrix_pose(values: np.ndarray, where: str) -> np.ndarray:
-    if len(values) == KITTI_COLUMNS:
-        values = np.append(values, [0.0, 0.0, 0.0, 1.0])
-    return rigid_or_error(values.reshape(4, 4), where)
-
-
-def _tum_pose(values: np.ndarray, where: str) -> np.ndarray:
-    return quaternion_pose(np.roll(values[3:], 1), values[:3], where)
+    return rigid_or_error(rigid_from_quaternion(wxyz / norm[:, None], translation), where)
 
 
 def _time_ns(value: float, where: str) -> int:

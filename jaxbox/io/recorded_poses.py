@@ -6,7 +6,6 @@ Frames are as in REP 105: a sensor is fixed to ``base_link``, whose pose in ``od
 References: REP 105 and the messages nav_msgs/Odometry, geometry_msgs/TransformStamped and tf2_msgs/TFMessage.
 """
 
-import collections
 import dataclasses
 import itertools
 import pathlib
@@ -18,7 +17,7 @@ import numpy as np
 from jaxbox._files import InputError
 from jaxbox.geometry.rigid import inverse_rigid
 from jaxbox.io.pointcloud2 import stamp_ns
-from jaxbox.io.pose_files import quaternion_pose
+from jaxbox.io.pose_files import rigid_from_quaternions
 from jaxbox.io.pose_track import PoseTrack, UnusableSource
 from jaxbox.io.recordings import PoseMessage
 
@@ -33,20 +32,32 @@ _STATIC = "tf_static"
 class _Samples:
     """Poses of one frame in another, as they come."""
 
+    topic: str
+    """That they are from."""
     stamps_ns: list[int] = dataclasses.field(default_factory=list)
     """By the messages' headers."""
     recorded_ns: list[int] = dataclasses.field(default_factory=list)
     """By the recording."""
-    poses: list[np.ndarray] = dataclasses.field(default_factory=list)
-    """(4, 4) float64, m."""
+    rows: list[tuple[float, ...]] = dataclasses.field(default_factory=list)
+    """Quaternion, the real part first, and position, m."""
+    poses: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 4, 4)))
+    """(M, 4, 4) float64, m, once all have come."""
 
-    def add(self, stamp: int, recorded: int, T: np.ndarray) -> None:
+    def add(self, stamp: int, recorded: int, rotation: Any, place: Any) -> None:
         self.stamps_ns.append(stamp)
         self.recorded_ns.append(recorded)
-        self.poses.append(T)
+        turn = (rotation.w, rotation.x, rotation.y, rotation.z)
+        self.rows.append((*turn, place.x, place.y, place.z))
+
+    def check(self, path: pathlib.Path) -> None:
+        """Makes poses of the numbers, all at once: there may be a hundred a second."""
+        rows = np.array(self.rows, np.float64).reshape(-1, 7)
+        self.poses = rigid_from_quaternions(
+            rows[:, :4], rows[:, 4:], lambda index: f"{path}, {self.topic} at {self.recorded_ns[index]}"
+        )
 
     def track(self, *, by_stamp: bool) -> PoseTrack:
-        return PoseTrack.sorted(self.stamps_ns if by_stamp else self.recorded_ns, np.array(self.poses))
+        return PoseTrack.sorted(self.stamps_ns if by_stamp else self.recorded_ns, self.poses)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,12 +66,19 @@ class RecordedPoses:
 
     path: pathlib.Path
     """The recording."""
-    odometry: dict[tuple[str, str], _Samples]
+    odometry: dict[tuple[str, str], _Samples] = dataclasses.field(default_factory=dict)
     """By topic and the frame whose pose it is."""
-    transforms: dict[str, dict[str, _Samples]]
+    transforms: dict[str, dict[str, _Samples]] = dataclasses.field(default_factory=dict)
     """Transforms by the child's frame and its parent's, T_parent_child."""
-    static: dict[str, tuple[str, np.ndarray]]
-    """Those that hold for the whole recording: parent and T_parent_child by the child's frame."""
+    static: dict[str, tuple[str, _Samples]] = dataclasses.field(default_factory=dict)
+    """Those that hold for the whole recording, by the child's frame: the parent, and T_parent_child, of
+    which the last counts."""
+
+    def all_samples(self) -> Iterator[_Samples]:
+        """Whatever was gathered."""
+        yield from self.odometry.values()
+        yield from (samples for parents in self.transforms.values() for samples in parents.values())
+        yield from (samples for _, samples in self.static.values())
 
 
 def collect_poses(messages: Iterable[PoseMessage], path: pathlib.Path) -> RecordedPoses:
@@ -76,37 +94,35 @@ def collect_poses(messages: Iterable[PoseMessage], path: pathlib.Path) -> Record
     Raises:
       InputError: naming recording, topic and time, for a pose that is none.
     """
-    found = RecordedPoses(
-        path,
-        collections.defaultdict(_Samples),
-        collections.defaultdict(lambda: collections.defaultdict(_Samples)),
-        {},
-    )
+    found = RecordedPoses(path)
     for topic, recorded, message in messages:
-        where = f"{path}, {topic} at {recorded}"
         if hasattr(message, "transforms"):
             for item in message.transforms:
-                T = _pose(item.transform.rotation, item.transform.translation, where)
-                child, parent = _frame(item.child_frame_id), _frame(item.header.frame_id)
-                if topic.endswith(_STATIC):
-                    found.static[child] = parent, T
-                else:
-                    found.transforms[child][parent].add(stamp_ns(item.header.stamp), recorded, T)
+                samples = _samples_of(found, topic, _frame(item.child_frame_id), _frame(item.header.frame_id))
+                stamp, T = stamp_ns(item.header.stamp), item.transform
+                samples.add(stamp, recorded, T.rotation, T.translation)
         else:
-            T = _pose(message.pose.pose.orientation, message.pose.pose.position, where)
             body = topic, _frame(message.child_frame_id)
-            found.odometry[body].add(stamp_ns(message.header.stamp), recorded, T)
+            samples = found.odometry.setdefault(body, _Samples(topic))
+            place = message.pose.pose
+            samples.add(stamp_ns(message.header.stamp), recorded, place.orientation, place.position)
+    for samples in found.all_samples():
+        samples.check(path)
     return found
+
+
+def _samples_of(found: RecordedPoses, topic: str, child: str, parent: str) -> _Samples:
+    """Where transforms of two frames are gathered."""
+    if not topic.endswith(_STATIC):
+        return found.transforms.setdefault(child, {}).setdefault(parent, _Samples(topic))
+    if child not in found.static or found.static[child][0] != parent:
+        found.static[child] = parent, _Samples(topic)
+    return found.static[child][1]
 
 
 def _frame(name: str) -> str:
     # ROS 1 allowed a slash before it.
     return name.strip("/")
-
-
-def _pose(rotation: Any, place: Any, where: str) -> np.ndarray:
-    wxyz = np.array([rotation.w, rotation.x, rotation.y, rotation.z], np.float64)
-    return quaternion_pose(wxyz, np.array([place.x, place.y, place.z], np.float64), where)
 
 
 class Transforms:
@@ -127,7 +143,7 @@ class Transforms:
         if child in self._recorded.static:
             return self._recorded.static[child][0]
         parents = self._recorded.transforms.get(child)
-        return max(parents, key=lambda name: len(parents[name].poses)) if parents else None
+        return max(parents, key=lambda name: len(parents[name].rows)) if parents else None
 
     def ancestors(self, frame: str) -> list[str]:
         """A frame and all above it, up to the root.
@@ -159,7 +175,7 @@ class Transforms:
 
     def _step(self, child: str, parent: str) -> np.ndarray:
         if child in self._recorded.static:
-            return self._recorded.static[child][1][None]
+            return self._recorded.static[child][1].poses[-1:]
         track = self._recorded.transforms[child][parent].track(by_stamp=self._by_stamp)
         try:
             return track.at(self._times_ns)
