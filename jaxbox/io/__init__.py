@@ -22,6 +22,7 @@ from jaxbox.io.kitti import (
     write_labels,
 )
 from jaxbox.io.kitti_calibration import read_calibration, read_raw_calibration, write_calibration
+from jaxbox.io.kitti_poses import read_oxts, read_raw_oxts
 from jaxbox.io.kitti_tracking import (
     objects_by_frame,
     objects_from_tracks,
@@ -30,7 +31,6 @@ from jaxbox.io.kitti_tracking import (
     read_tracks,
     write_tracks,
 )
-from jaxbox.io.kitti_poses import read_oxts, read_raw_oxts
 from jaxbox.io.labelled import LabelledBoxes
 from jaxbox.io.las import read_las
 from jaxbox.io.levelled import LevelSweeps, measure_sweeps

@@ -114,14 +114,18 @@ def _lateral_shift(
 
     before = place(np.minimum(start + end, stop)) - place(start)
     after = place(stop) - place(np.maximum(stop - end, start))
-    first, last = (np.arctan2(d[..., 1], d[..., 0]) for d in (before, after))
-    change = _wrap(last - first)
-    course = first + change / 2
     way = place(stop) - place(start)
-    shift = way[..., 1] * np.cos(course) - way[..., 0] * np.sin(course)
+    left_of_before, left_of_after = _offset(way, before), _offset(way, after)
     far = np.minimum(np.linalg.norm(before, axis=-1), np.linalg.norm(after, axis=-1)) > LANE_END_M
-    straight = np.abs(change) < np.deg2rad(config.lane_course_deg)
-    found = (
-        whole & far & straight & _all_between(moving, start, stop) & (np.abs(shift) > config.lane_change_m)
-    )
-    return np.where(found, shift, 0.0)
+    first, last = (np.arctan2(d[..., 1], d[..., 0]) for d in (before, after))
+    straight = np.abs(_wrap(last - first)) < np.deg2rad(config.lane_course_deg)
+    aside = np.minimum(np.abs(left_of_before), np.abs(left_of_after)) > config.lane_change_m
+    aside &= left_of_before * left_of_after > 0
+    found = whole & far & straight & aside & _all_between(moving, start, stop)
+    return np.where(found, (left_of_before + left_of_after) / 2, 0.0)
+
+
+def _offset(way: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """(I, L) m: how far ways end to the left of lines in some directions."""
+    across = direction[..., 0] * way[..., 1] - direction[..., 1] * way[..., 0]
+    return across / np.maximum(np.linalg.norm(direction, axis=-1), 1e-6)

@@ -68,7 +68,7 @@ def smooth(
         )
     config = TrackConfig() if config is None else config
     T_world_sensor, time_s = np.asarray(T_world_sensor, float), np.asarray(time_s, float)
-    groups = gather_paths(tracks, seen, T_world_sensor, time_s)
+    groups = gather_paths(tracks, seen, T_world_sensor, time_s) if len(tracks) else ()
     parts = [_smooth_group(paths, tracks, T_world_sensor, config) for paths in groups]
     if not parts:
         return [_pick(of_sweep, {}, np.zeros(0, int)) for of_sweep in tracks]
@@ -193,9 +193,24 @@ def _between(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
     return before, after, (time - start) / np.maximum(stop - start, 1e-9), stop - start
 
 
-def _fronts(yaw: np.ndarray, velocity: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(I, L) rad: where the fronts point; and (I,), how sure that is, by the motion of the whole track."""
+def _fronts(
+    yaw: np.ndarray, velocity: np.ndarray, moving: np.ndarray, first_turn: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where the fronts point, without jumps, and how sure that is, by the motion of the whole track.
+
+    Args:
+      yaw: (I, L) rad, world.
+      velocity: (I, L, 2) m/s.
+      moving: (I, L) bool.
+      first_turn: (I,) rad, of the sensor in the first sweep: the front of what never moved is taken to point
+        away from that sensor's back.
+
+    Returns:
+      heading (I, L) rad, and probability (I,).
+    """
     heading = np.unwrap(yaw, period=np.pi, axis=1)
+    start = wrap_axis(heading[:, 0] - first_turn) + first_turn
+    heading = heading + (start - heading[:, 0])[:, None]
     along = velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
     votes = np.sum(np.clip(along / COURSE_SPEED_MPS, -1, 1) * moving, axis=1)
     heading = heading + np.where(votes < 0, np.pi, 0.0)[:, None]
@@ -222,7 +237,10 @@ def _smooth_group(
         return start + share * (stop - start)
 
     motion, shift = classify_paths(position, velocity, covariance, paths, config)
-    heading, front_probability = _fronts(yaw, velocity, motion != Motion.STANDING)
+    first = T_world_sensor[paths.first]
+    first_turn = np.arctan2(first[:, 1, 0], first[:, 0, 0])
+    moving = paths.valid & (motion != Motion.STANDING)
+    heading, front_probability = _fronts(yaw, velocity, moving, first_turn)
     hits = paths.hit.sum(axis=1)
     mean_score = paths.score.sum(axis=1) / hits
     own_score = mean_score[:, None] ** TRACK_SHARE * paths.score ** (1 - TRACK_SHARE)
@@ -235,7 +253,7 @@ def _smooth_group(
         "heading": heading,
         "front_probability": np.broadcast_to(front_probability[:, None], yaw.shape),
         "velocity": velocity,
-        "turn_rate": _turn_rate(heading, paths.step_s),
+        "turn_rate": _turn_rate(heading, paths),
         "covariance": covariance,
         "motion": motion,
         "lateral_shift_m": shift,
@@ -246,12 +264,13 @@ def _smooth_group(
     return _rows(paths, columns, paths.valid & (paths.hit | (gap_s <= MAX_GAP_S)), tracks, T_world_sensor)
 
 
-def _turn_rate(heading: np.ndarray, step_s: np.ndarray) -> np.ndarray:
+def _turn_rate(heading: np.ndarray, paths: Paths) -> np.ndarray:
     """(I, L) rad/s: change of the heading, which goes on without jumps, around each moment."""
-    time = np.cumsum(np.maximum(step_s, 1e-3), axis=1)
-    if heading.shape[1] < 2:
-        return np.zeros_like(heading)
-    return np.stack([np.gradient(h, t) for h, t in zip(heading, time, strict=True)])
+    time, rate = np.cumsum(np.maximum(paths.step_s, 1e-3), axis=1), np.zeros_like(heading)
+    for track, length in enumerate(paths.length):
+        if length > 1:
+            rate[track, :length] = np.gradient(heading[track, :length], time[track, :length])
+    return rate
 
 
 def _rows(
