@@ -251,3 +251,22 @@ def load_hook():
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+def test_times_of_a_sequence_are_put_in_order_by_sweep_and_pass(benchmark):
+    tracking = benchmark("bench_tracking_step")
+    # Two sequences of two and three sweeps, three passes each, of which the first compiles.
+    rows = [
+        (length, 100.0 if number == 0 else 10 * sweep + number, 1.0, 2.0)
+        for length in (3, 2)
+        for number in range(3)
+        for sweep in range(length)
+    ]
+    figures = tracking.summarise(np.array(rows), 2)
+    assert figures["num_sweeps"] == 5
+    assert (figures["ms"]["detect"]["runs"], figures["ms"]["detect"]["min"]) == (10, 1)
+    # The best of each sweep: 1, 11, 21 and 1, 11.
+    assert figures["ms"]["detect"]["median_of_best"] == 11
+    assert figures["ms"]["track_step"]["p99"] == 2
+    # The loop that an accelerator's host waits for is that of the assignment.
+    assert tracking.count_loops() == 1
