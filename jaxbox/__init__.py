@@ -1,13 +1,15 @@
 """jaxbox: training-free LiDAR vehicle detection as one compiled JAX function."""
 
 from jaxbox._version import __version__
-from jaxbox.config import DEFAULT_SCORE_THRESHOLD, DetectorConfig, propose_capacities
+from jaxbox.config import DEFAULT_SCORE_THRESHOLD, DetectorConfig, TrackConfig, propose_capacities
 from jaxbox.run import serialization as _serialization  # noqa: F401 - jax.export learns the types below
 from jaxbox.run.batching import detect_batch
 from jaxbox.run.cache import enable_cache
 from jaxbox.run.compiled import detect
 from jaxbox.run.streaming import StreamedSweep, stream
 from jaxbox.run.summary import Summary, summarise
+from jaxbox.run.tracking import TrackedSweep, track
+from jaxbox.tracking.tracks import Sight, Tracks, TrackStatus
 from jaxbox.types import (
     Calibration,
     Detections,
@@ -30,9 +32,14 @@ __all__ = [
     "Label",
     "Motion",
     "PointCloud",
+    "Sight",
     "Status",
     "StreamedSweep",
     "Summary",
+    "TrackConfig",
+    "TrackStatus",
+    "TrackedSweep",
+    "Tracks",
     "__version__",
     "detect",
     "detect_batch",
@@ -41,4 +48,5 @@ __all__ = [
     "stack_clouds",
     "stream",
     "summarise",
+    "track",
 ]

@@ -1,14 +1,13 @@
-"""The seven commands and their options; the work is done in the module of each."""
+"""The eight commands and their options; the work is done in the module of each."""
 
 import enum
-import math
 import pathlib
 from typing import Annotated
 
 import typer
 
 from jaxbox._version import __version__
-from jaxbox.cli.config_options import chosen_config, chosen_preset, complete_preset, complete_setting
+from jaxbox.cli.config_options import chosen_config, chosen_preset
 from jaxbox.cli.console import cache_warnings, input_errors, stdout
 from jaxbox.cli.demo import run_demo
 from jaxbox.cli.detect import DetectOptions, ResultFormat, run_detect
@@ -16,9 +15,21 @@ from jaxbox.cli.detect_ray import RayOptions, run_detect_ray
 from jaxbox.cli.eval_command import DrivesOption, evaluate
 from jaxbox.cli.export import Platform, run_export
 from jaxbox.cli.info import print_info
+from jaxbox.cli.options import (
+    EXIT_CODES,
+    CapacityOption,
+    LevelOption,
+    PresetOption,
+    SensorAtOption,
+    SensorOption,
+    SetOption,
+    SettingsOption,
+    TopicOption,
+)
 from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.cli.sweep_info import print_sweep_info
 from jaxbox.cli.threads import compute_on_one_thread
+from jaxbox.cli.track_command import TRACK_EXAMPLES, track
 from jaxbox.cli.tune import TuneOptions, run_tune
 from jaxbox.cli.view import ViewOptions, run_view
 from jaxbox.cluster.dataset import SWEEPS_PER_PARTITION
@@ -27,61 +38,6 @@ from jaxbox.evaluation.objectives import OBJECTIVES
 from jaxbox.io import InputError
 from jaxbox.run.cache import enable_cache
 
-PresetOption = Annotated[
-    str | None,
-    typer.Option(
-        help="Settings to start from: default, fast, or paper for the paper's choices.",
-        autocompletion=complete_preset,
-    ),
-]
-SensorOption = Annotated[
-    int | None,
-    typer.Option(
-        metavar="BEAMS", help="Fit the preset to a sensor: 16, 32, 64 or 128 beams; `info FILE` says which."
-    ),
-]
-SettingsOption = Annotated[
-    pathlib.Path | None,
-    typer.Option(
-        "--config",
-        "--settings",
-        help="Settings file: TOML, or JSON such as best.json of `tune`; docs/settings.md.",
-    ),
-]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="FIELD=VALUE",
-        help="Change one setting by its name; repeatable.",
-        autocompletion=complete_setting,
-    ),
-]
-TopicOption = Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")]
-
-
-def _finite_position(position: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
-    if position is not None and not all(map(math.isfinite, position)):
-        raise typer.BadParameter(f"{' '.join(map(str, position))}: give three finite numbers, in metres.")
-    return position
-
-
-SensorAtOption = Annotated[
-    tuple[float, float, float] | None,
-    typer.Option(
-        metavar="X Y Z",
-        callback=_finite_position,
-        help="Where the sensor is in the points' frame (m), if not at 0 0 0.",
-    ),
-]
-LevelOption = Annotated[
-    bool, typer.Option("--level", help="Measure how the sensor is tilted, and see the sweeps upright.")
-]
-CapacityOption = Annotated[
-    int | None,
-    typer.Option(min=1, help="Points a sweep is padded to; by default what it needs. One compile each."),
-]
-
 
 class Engine(enum.StrEnum):
     """What `detect` runs on."""
@@ -89,11 +45,6 @@ class Engine(enum.StrEnum):
     LOCAL = "local"
     RAY = "ray"
 
-
-EXIT_CODES = (
-    "Exit codes: 0 all went well; 1 some sweeps failed or it was interrupted, the others are done; "
-    "2 the input or an option cannot be used, or results cannot be written."
-)
 
 DETECT_EXAMPLES = """Examples:
 
@@ -304,6 +255,7 @@ def detect(
         raise typer.Exit(run_detect(paths, options))
 
 
+app.command(epilog=TRACK_EXAMPLES + EXIT_CODES)(track)
 app.command("eval", epilog=EXIT_CODES)(evaluate)
 
 

@@ -3,7 +3,7 @@
 import pathlib
 from collections.abc import Sequence
 
-from jaxbox.config import DetectorConfig
+from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.config.checks import check_config
 from jaxbox.config.fields import all_fields, base_of, parse_change, preset_config, replace_fields
 from jaxbox.io import InputError, read_config
@@ -53,6 +53,27 @@ def chosen_config(
     return config
 
 
+def chosen_track_config(changes: Sequence[str]) -> TrackConfig:
+    """The settings of the tracker.
+
+    Args:
+      changes: each ``FIELD=VALUE``, to the defaults.
+
+    Returns:
+      The settings.
+
+    Raises:
+      InputError: for an unknown setting, with the nearest, or a value that does not fit.
+
+    >>> chosen_track_config(["max_misses=6"]).max_misses
+    6.0
+    """
+    try:
+        return replace_fields(TrackConfig(), dict(parse_change(change) for change in changes))
+    except ValueError as error:
+        raise InputError(f"--track-set: {error}") from error
+
+
 def chosen_preset(preset: str | None, file: pathlib.Path | None) -> str:
     """Name of the preset that `chosen_config` starts from.
 
@@ -87,3 +108,12 @@ def complete_setting(incomplete: str) -> list[str]:
     ['ground.tolerance_m=']
     """
     return [f"{name}=" for name in all_fields(DetectorConfig()) if name.startswith(incomplete)]
+
+
+def complete_track_setting(incomplete: str) -> list[str]:
+    """Settings of the tracker that a shell proposes, up to where the value is to be typed.
+
+    >>> complete_track_setting("max_m")
+    ['max_misses=']
+    """
+    return [f"{name}=" for name in all_fields(TrackConfig()) if name.startswith(incomplete)]

@@ -49,6 +49,11 @@ def print_error(message: str) -> None:
     stderr().print(Text.assemble(("error: ", "bold red"), message))
 
 
+def print_warning(message: str) -> None:
+    """Prints one line to stderr, as `print_error`: something to know, after which all goes on."""
+    stderr().print(Text.assemble(("warning: ", "bold yellow"), message))
+
+
 @contextlib.contextmanager
 def cache_warnings() -> Iterator[None]:
     """Turns the reason why nothing is kept between runs into one line on stderr."""
@@ -56,7 +61,7 @@ def cache_warnings() -> Iterator[None]:
         warnings.simplefilter("always", CacheWarning)
         yield
     for warning in caught:
-        stderr().print(Text.assemble(("warning: ", "bold yellow"), str(warning.message)))
+        print_warning(str(warning.message))
 
 
 @contextlib.contextmanager

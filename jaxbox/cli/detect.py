@@ -1,8 +1,6 @@
 """``jaxbox detect``: sweeps of files, folders and recordings to result files and pictures, one by one."""
 
 import dataclasses
-import json
-import pathlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 
@@ -11,66 +9,30 @@ from rich.progress import Progress
 from jaxbox import io
 from jaxbox.cli.console import ExitCode, make_progress, print_error, stderr, stdout, stoppable, undisturbed
 from jaxbox.cli.frames import Frame, FrameSource, FrameWork
-from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
+from jaxbox.cli.inputs import PICTURE_FOLDER, RunOptions, prepare_run, print_json, reasons_as_json
 from jaxbox.cli.report import (
-    SHOWN_MIN_SCORE,
     FrameOutcome,
     FrameReport,
     RunReport,
     describe_frame,
     describe_run,
 )
-from jaxbox.cli.results import RUN_NAME, ResultFormat, Results, RunAccount, written
-from jaxbox.config import DetectorConfig
+from jaxbox.cli.results import ResultFormat, Results
 from jaxbox.io.jsonl import JSONL
 from jaxbox.run.processes import WorkerDied
 from jaxbox.run.summary import summarise
 
-PICTURE_FOLDER = "pictures"
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class DetectOptions:
+class DetectOptions(RunOptions):
     """The options of ``jaxbox detect``; the command's help explains them."""
 
-    output: pathlib.Path
-    """Folder for results and pictures."""
-    config: DetectorConfig
-    """The detector's settings."""
     formats: frozenset[ResultFormat]
     """What to write."""
-    topic: str | None
-    """Topic of the points in recordings."""
-    sensor_at: tuple[float, float, float] | None
-    """Where the sensor is in the frame of the points, m; None for the origin."""
-    level: bool
-    """Whether its tilt is measured, and the sweeps are seen upright."""
-    capacity: int | None
-    """Points a sweep is padded to, or None for what it needs."""
-    min_score: float
-    """Boxes with lower scores are dropped."""
     points: bool
     """Whether MCAP and rerun files hold the points too."""
     pictures: bool
     """Whether pictures are drawn."""
-    resume: bool
-    """Whether sweeps with complete results are passed over."""
-    quiet: bool
-    """Whether only errors are printed."""
-    json: bool
-    """Whether stdout is JSON Lines."""
-    jobs: int = 1
-    """Processes that read, detect and draw."""
-
-    @property
-    def shown_min_score(self) -> float:
-        """Boxes that score less are neither drawn nor counted."""
-        return max(SHOWN_MIN_SCORE, self.min_score)
-
-    @property
-    def speaks(self) -> bool:
-        """Whether sentences are printed."""
-        return not (self.quiet or self.json)
 
 
 def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
@@ -88,11 +50,7 @@ def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
     Raises:
       InputError: where a path holds no sweeps, or the options cannot be used.
     """
-    sweeps, account = _prepare(paths, options)
-    with written(options.output):
-        options.output.mkdir(parents=True, exist_ok=True)
-    for folder in (options.output, options.output / PICTURE_FOLDER):
-        io.remove_abandoned(folder)
+    sweeps, account = prepare_run(paths, options)
     run = RunReport(jobs=options.jobs)
     start = time.perf_counter()
     with Results(
@@ -110,43 +68,11 @@ def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
         interrupted=run.interrupted,
         num_done=len(run.frames),
         num_skipped=run.num_skipped,
-        failures=_as_json(run.failures),
-        repeated=_as_json(run.repeated),
+        failures=reasons_as_json(run.failures),
+        repeated=reasons_as_json(run.repeated),
     )
     _report(run, results, options)
     return ExitCode.FRAME_FAILED if run.failures or run.interrupted else ExitCode.OK
-
-
-def _prepare(paths: Sequence[str], options: DetectOptions) -> tuple[Sequence[io.Sweep], RunAccount]:
-    """The sweeps as they are seen from the sensor, and the account, which the earlier run's was held to."""
-    sweeps = io.open_sweeps(paths, topic=options.topic)
-    account = RunAccount(
-        output=options.output,
-        config=options.config,
-        options={
-            "min_score": options.min_score,
-            "capacity": options.capacity,
-            "topic": options.topic,
-            "sensor_at": None if options.sensor_at is None else list(options.sensor_at),
-            "level": options.level,
-        },
-        inputs=tuple(paths),
-    )
-    if options.resume:
-        account.check_resumable()
-    # Measured again where the archive has grown, the sensor would stand otherwise than for what is there.
-    earlier = account.earlier_mounting() if options.resume and options.level else None
-    sweeps, mounting = seen_from_sensor(
-        sweeps, sensor_at=options.sensor_at, level=options.level, measured=earlier
-    )
-    if options.level and mounting is not None and options.speaks:
-        where = f"see T_level_points in {RUN_NAME}"
-        stdout().print(f"{describe_mounting(mounting)}, {where}", markup=False)
-    return sweeps, dataclasses.replace(account, mounting=mounting)
-
-
-def _as_json(reasons: list[tuple[str, str]]) -> list[dict[str, str]]:
-    return [{"sweep": name, "reason": reason} for name, reason in reasons]
 
 
 def _run_sweeps(sweeps: Sequence[io.Sweep], options: DetectOptions, run: RunReport, results: Results) -> None:
@@ -214,15 +140,11 @@ def _report(run: RunReport, results: Results, options: DetectOptions) -> None:
         )
     if options.json:
         counts = {"done": len(run.frames), "skipped": run.num_skipped, "interrupted": run.interrupted}
-        lists = {"failures": _as_json(run.failures), "repeated": _as_json(run.repeated)}
-        _print_json({"summary": {**counts, **lists}})
+        lists = {"failures": reasons_as_json(run.failures), "repeated": reasons_as_json(run.repeated)}
+        print_json({"summary": {**counts, **lists}})
     elif options.speaks:
         for line in describe_run(run):
             stdout().print(line, markup=False)
-
-
-def _print_json(value: dict) -> None:
-    stdout().out(json.dumps(value, allow_nan=False), highlight=False)
 
 
 def _run_frame(
@@ -261,7 +183,7 @@ def _write(
     if options.json:
         health = summarise(frame.detections, options.config).to_dict()
         timing = {"num_points": frame.num_points, "detect_ms": round(frame.detect_s * 1e3, 3)}
-        _print_json({**record, **timing, "health": health})
+        print_json({**record, **timing, "health": health})
     run.add_compile_times(frame.compile_s)
     if frame.picture_error is not None:
         raise frame.picture_error

@@ -232,6 +232,26 @@ class RunAccount:
                 "by; give another --output."
             ) from error
 
+    def earlier_incomplete(self) -> frozenset[str] | None:
+        """Sequences that the run that is resumed has begun or was to do, and not finished.
+
+        Returns:
+          Their names; None where there is no earlier run.
+
+        Raises:
+          InputError: where its account does not say.
+        """
+        if not (self.output / CONFIG_NAME).is_file():
+            return None
+        path = self.output / RUN_NAME
+        try:
+            return frozenset(map(str, json.loads(path.read_bytes())["incomplete"]))
+        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+            raise io.InputError(
+                f"{path}: it does not say which sequences are incomplete, which --resume goes by; give "
+                "another --output."
+            ) from error
+
     def write(self, **outcome: Any) -> None:
         """Writes the two files; before the run without an outcome, and after it."""
         account = {

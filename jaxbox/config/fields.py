@@ -15,11 +15,14 @@ import math
 import tomllib
 import typing
 from collections.abc import Iterator, Mapping
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import jax
 
-from jaxbox.config import DetectorConfig
+from jaxbox.config import DetectorConfig, TrackConfig
+
+Config = TypeVar("Config", DetectorConfig, TrackConfig)
+"""Settings of the detector or of the tracker."""
 
 NUM_NEAREST = 3
 """Names that an error proposes."""
@@ -54,7 +57,7 @@ def traced_fields(config: DetectorConfig) -> dict[str, Any]:
     return {name: leaf.value for name, leaf in _leaves(config) if not leaf.static}
 
 
-def all_fields(config: DetectorConfig) -> dict[str, Any]:
+def all_fields(config: DetectorConfig | TrackConfig) -> dict[str, Any]:
     """Every setting by its dotted name, the static ones too.
 
     Args:
@@ -69,7 +72,7 @@ def all_fields(config: DetectorConfig) -> dict[str, Any]:
     return {name: leaf.value for name, leaf in _leaves(config)}
 
 
-def replace_fields(config: DetectorConfig, changes: Mapping[str, Any]) -> DetectorConfig:
+def replace_fields(config: Config, changes: Mapping[str, Any]) -> Config:
     """Changes settings by their dotted names.
 
     Args:

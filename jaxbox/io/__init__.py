@@ -10,7 +10,7 @@ from jaxbox.io.argoverse2 import (
 from jaxbox.io.config import read_config, write_config
 from jaxbox.io.drives import read_drives
 from jaxbox.io.images import read_image
-from jaxbox.io.jsonl import detections_record, read_jsonl, write_jsonl
+from jaxbox.io.jsonl import detections_record, read_jsonl, tracks_record, write_jsonl
 from jaxbox.io.kitti import (
     VEHICLE_TYPES,
     KittiObject,
@@ -107,6 +107,7 @@ __all__ = [
     "read_track_folder",
     "read_tracks",
     "remove_abandoned",
+    "tracks_record",
     "write_bin",
     "write_calibration",
     "write_config",

@@ -1,4 +1,4 @@
-"""Detections as JSON Lines: one sweep a line, in the sensor frame, so that no calibration is needed."""
+"""Detections, or tracks, as JSON Lines: one sweep a line, in the sensor frame, which needs no calibration."""
 
 import contextlib
 import dataclasses
@@ -12,7 +12,9 @@ import numpy as np
 
 from jaxbox._files import InputError, atomic_writer, parse_json, read_text
 from jaxbox.io.results import ResultFile, WriteResult
-from jaxbox.types import Counts, Detections, Label, Status
+from jaxbox.run.tracking import TrackedSweep
+from jaxbox.tracking.tracks import Sight, TrackCounts, Tracks, TrackStatus
+from jaxbox.types import Counts, Detections, Label, Motion, Status
 
 
 def detections_record(
@@ -53,7 +55,89 @@ def _box(detections: Detections, row: int) -> dict[str, Any]:
     }
 
 
-def _counts(counts: Counts) -> dict[str, Any]:
+def tracks_record(
+    tracked: TrackedSweep,
+    *,
+    sequence: str,
+    frame: int,
+    time_s: float,
+    min_score: float = 0.0,
+    confirmed: bool = False,
+) -> dict[str, Any]:
+    """Gathers what one sweep's line says of its tracks.
+
+    Args:
+      tracked: a sweep that went through.
+      sequence: name of the sweep's drive.
+      frame: number of the sweep in it.
+      time_s: since the first sweep of the drive, s.
+      min_score: tracks that score less are left out.
+      confirmed: whether tracks that are not confirmed are left out.
+
+    Returns:
+      What `detections_record` has, with `TrackStatus` and `TrackCounts`, and: ``sequence``, ``frame``,
+      ``time_s``, ``T_world_sensor`` (4 x 4, m) and ``pose_source``; in each box ``id``, ``state`` (a `Motion`
+      in words), ``sight`` ("seen", "hidden" or "coasting"), ``confirmed``, and the other fields of `Tracks`,
+      in metres, radians and seconds, sensor frame of the sweep. ``num_points`` is 0 without a detection. A
+      sweep that was passed over (`TrackStatus.TIME_NOT_LATER`) has no boxes.
+
+    Raises:
+      ValueError: for a sweep that failed.
+    """
+    tracks = tracked.tracks
+    if tracks is None or tracked.detections is None or tracked.T_world_sensor is None:
+        raise ValueError(f"{tracked.name} failed ({tracked.error}); it has no tracks.")
+    keep = np.asarray(tracks.valid) & (np.asarray(tracks.score) >= min_score)
+    keep &= np.asarray(tracks.confirmed) | (not confirmed)
+    keep &= TrackStatus.TIME_NOT_LATER not in tracked.status
+    rows = sorted(np.flatnonzero(keep).tolist(), key=lambda row: int(tracks.id[row]))
+    num_points = np.append(np.asarray(tracked.detections.num_points), 0)
+    return {
+        "name": tracked.name,
+        "sequence": sequence,
+        "frame": frame,
+        "timestamp_ns": getattr(tracked.sweep, "timestamp_ns", None),
+        "time_s": time_s,
+        "T_world_sensor": tracked.T_world_sensor.tolist(),
+        "pose_source": str(tracked.pose_source),
+        "boxes": [_track_box(tracks, row, int(num_points[tracks.detection[row]])) for row in rows],
+        "status": tracked.status.describe(),
+        "counts": _counts(tracks.counts),
+    }
+
+
+_LISTED = (
+    "score", "center", "size", "yaw", "age", "hits", "detection", "lateral_shift_m", "heading",
+    "front_probability", "velocity", "speed", "turn_rate", "covariance", "filtered_center", "filtered_size",
+    "filtered_yaw",
+)  # fmt: skip
+
+
+def _track_box(tracks: Tracks, row: int, num_points: int) -> dict[str, Any]:
+    return {
+        "id": int(tracks.id[row]),
+        "label": Label(int(tracks.label[row])).word,
+        "state": motion_word(int(tracks.motion[row])),
+        "sight": Sight(int(tracks.sight[row])).name.lower(),
+        "confirmed": bool(tracks.confirmed[row]),
+        "num_points": num_points,
+        **{name: np.asarray(getattr(tracks, name))[row].tolist() for name in _LISTED},
+        "label_probability": {
+            label.word: float(tracks.label_probability[row][label.value]) for label in Label
+        },
+    }
+
+
+def motion_word(motion: int) -> str:
+    """A `Motion` as results name it.
+
+    >>> motion_word(5)
+    'lane change'
+    """
+    return Motion(motion).name.lower().replace("_", " ")
+
+
+def _counts(counts: Counts | TrackCounts) -> dict[str, Any]:
     names = [field.name for field in dataclasses.fields(counts)]
     return {name: np.asarray(getattr(counts, name)).tolist() for name in names}
 

@@ -7,11 +7,13 @@ Reference: the tracking development kit's readme; the detections are those of We
 Tracking: A Baseline and New Evaluation Metrics", IROS 2020 (AB3DMOT).
 """
 
+import contextlib
 import dataclasses
 import itertools
 import os
 import pathlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +26,7 @@ from jaxbox.io.kitti import (
     whole_number,
     write_labels,
 )
+from jaxbox.io.results import SweepResult, WriteResult
 from jaxbox.types import Calibration
 
 NO_TRACK = -1
@@ -231,3 +234,56 @@ def objects_from_tracks(
         for item, score, track_id in zip(objects, scores, track_ids, strict=True)
         if item is not None
     ]
+
+
+def objects_from_record(
+    record: Mapping[str, Any], calibration: Calibration, *, coasting: bool = False
+) -> list[KittiObject]:
+    """Turns what is written of a sweep's tracks into KITTI results: those that the camera sees.
+
+    Args:
+      record: as `jaxbox.io.tracks_record` makes it.
+      calibration: the camera whose image the 2D boxes are in.
+      coasting: whether tracks are written too that were not detected in the sweep.
+
+    Returns:
+      The objects, whose ``rotation_y`` points to the front.
+    """
+    boxes = [box for box in record["boxes"] if coasting or box["detection"] >= 0]
+    return objects_from_tracks(
+        np.array([[*box["center"], *box["size"], box["heading"]] for box in boxes]),
+        np.array([box["score"] for box in boxes]),
+        np.array([box["id"] for box in boxes], int),
+        calibration,
+        frame=record["frame"],
+        types=[box["label"].capitalize() for box in boxes],
+    )
+
+
+@contextlib.contextmanager
+def open_track_text(
+    path: pathlib.Path, resume: bool = False, *, coasting: bool = False
+) -> Iterator[WriteResult]:
+    """Opens a tracking result file for the tracks of a drive.
+
+    Args:
+      path: the file, which KITTI names after the sequence: ``0000.txt``.
+      resume: must be False: a drive is written as a whole.
+      coasting: as `objects_from_record`.
+
+    Yields:
+      What adds a sweep; one without calibration adds nothing.
+
+    Raises:
+      ValueError: for `resume`.
+    """
+    if resume:
+        raise ValueError("a file of tracks is not continued.")
+    objects: list[KittiObject] = []
+
+    def write(result: SweepResult) -> None:
+        if result.calibration is not None:
+            objects.extend(objects_from_record(result.record, result.calibration, coasting=coasting))
+
+    yield write
+    write_tracks(path, objects)

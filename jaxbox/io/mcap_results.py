@@ -1,7 +1,8 @@
-"""Detections as an MCAP file that Foxglove plays: boxes, the points where wanted, and the plain records.
+"""Detections, or tracks, as an MCAP file that Foxglove plays: boxes, points where wanted, and the records.
 
 Topics: ``/jaxbox/boxes`` (``foxglove.SceneUpdate``), ``/jaxbox/points`` (``foxglove.PointCloud``), both in
-the frame ``lidar``, and ``/jaxbox/detections``, the line that JSON Lines would have, as JSON.
+the frame ``lidar``, and ``/jaxbox/detections``, the line that JSON Lines would have, as JSON. Of tracks it is
+``/jaxbox/tracks``, and ``/jaxbox/pose`` (``foxglove.FrameTransform``) says where the sensor is in ``world``.
 """
 
 import contextlib
@@ -14,7 +15,7 @@ import numpy as np
 
 from jaxbox._extras import require
 from jaxbox._files import InputError, atomic_path
-from jaxbox.io.foxglove import point_cloud, scene_update
+from jaxbox.io.foxglove import frame_transform, point_cloud, scene_update
 from jaxbox.io.mcap_file import open_mcap_file
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
 
@@ -24,10 +25,16 @@ POINTS_TOPIC = "/jaxbox/points"
 """Topic of the points."""
 RECORDS_TOPIC = "/jaxbox/detections"
 """Topic of the records."""
+TRACKS_TOPIC = "/jaxbox/tracks"
+"""Topic of the records of tracks."""
+POSE_TOPIC = "/jaxbox/pose"
+"""Topic of the poses of the sensor, of tracks."""
 FRAME_ID = "lidar"
 """Coordinate frame of boxes and points."""
+WORLD_ID = "world"
+"""Coordinate frame of the poses."""
 
-_RECORD_SCHEMA = {"title": "jaxbox.Detections", "type": "object"}
+_TITLES = {RECORDS_TOPIC: "jaxbox.Detections", TRACKS_TOPIC: "jaxbox.Tracks"}
 
 
 @contextlib.contextmanager
@@ -60,12 +67,23 @@ def open_mcap_results(path: pathlib.Path, resume: bool = False) -> Iterator[Writ
             if result.xyz is not None:
                 intensity = np.zeros(len(result.xyz)) if result.intensity is None else result.intensity
                 channels.add_message(POINTS_TOPIC, point_cloud(result.xyz, intensity, **common), time_ns)
-            channels.add_message(BOXES_TOPIC, scene_update(result.record, **common), time_ns)
-            channels.add_record(result.record, time_ns)
+            if result.trails is not None:
+                pose = np.array(result.record["T_world_sensor"])
+                channels.add_message(POSE_TOPIC, _transform(pose, time_ns), time_ns)
+            scene = scene_update(result.record, trails=result.trails, **common)
+            channels.add_message(BOXES_TOPIC, scene, time_ns)
+            topic = RECORDS_TOPIC if result.trails is None else TRACKS_TOPIC
+            channels.add_record(topic, result.record, time_ns)
             index += 1
 
         yield write
         writer.finish()
+
+
+def _transform(T_world_sensor: np.ndarray, time_ns: int) -> Any:
+    return frame_transform(
+        T_world_sensor, timestamp_ns=time_ns, parent_frame_id=WORLD_ID, child_frame_id=FRAME_ID
+    )
 
 
 class _Channels:
@@ -82,14 +100,15 @@ class _Channels:
             self._ids[topic] = self._writer.register_channel(topic, "protobuf", schema)
         self._writer.add_message(self._ids[topic], time_ns, message.SerializeToString(), time_ns)
 
-    def add_record(self, record: Any, time_ns: int) -> None:
+    def add_record(self, topic: str, record: Any, time_ns: int) -> None:
         """Adds a record as JSON."""
-        if RECORDS_TOPIC not in self._ids:
-            schema = json.dumps(_RECORD_SCHEMA).encode()
-            schema = self._writer.register_schema(_RECORD_SCHEMA["title"], "jsonschema", schema)
-            self._ids[RECORDS_TOPIC] = self._writer.register_channel(RECORDS_TOPIC, "json", schema)
+        if topic not in self._ids:
+            title = _TITLES[topic]
+            schema = json.dumps({"title": title, "type": "object"}).encode()
+            schema = self._writer.register_schema(title, "jsonschema", schema)
+            self._ids[topic] = self._writer.register_channel(topic, "json", schema)
         data = json.dumps(record, allow_nan=False).encode()
-        self._writer.add_message(self._ids[RECORDS_TOPIC], time_ns, data, time_ns)
+        self._writer.add_message(self._ids[topic], time_ns, data, time_ns)
 
     def add_raw(self, schema: Any, channel: Any, message: Any) -> None:
         """Adds a message of another file as it is."""

@@ -1,19 +1,23 @@
-"""Detections as Apache Parquet, one row a box, for tables and clusters: pandas, DuckDB, Spark.
+"""Detections, or tracks, as Apache Parquet, one row a box, for pandas, DuckDB and Spark.
 
 Columns: ``sweep`` (its name), ``timestamp_ns`` (int64, ns since 1970, or null), ``label`` (a
 `Label.word`, such as "car"), ``score``, ``center_x``, ``center_y``, ``center_z``, ``length``, ``width``,
 ``height`` (m, sensor frame), ``yaw`` (rad), all float32, and ``num_points`` (int32). A sweep without boxes
 has no row; the names of all sweeps are a JSON list in the file's metadata under ``jaxbox.sweeps``.
+Tracks have more columns, `TRACK_COLUMNS`, also in text with commas.
 """
 
 import contextlib
+import csv
 import json
 import pathlib
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+import numpy as np
+
 from jaxbox._extras import require
-from jaxbox._files import InputError, atomic_path, reason
+from jaxbox._files import InputError, atomic_path, atomic_writer, reason
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
 
 PARQUET_COLUMNS: Mapping[str, str] = {
@@ -23,6 +27,15 @@ PARQUET_COLUMNS: Mapping[str, str] = {
 }  # fmt: skip
 """The columns and Arrow's names of their types."""
 
+TRACK_COLUMNS: Mapping[str, str] = {
+    "sequence": "string", "frame": "int32", "time_s": "float64", "id": "int32", **PARQUET_COLUMNS,
+    "state": "string", "sight": "string", "confirmed": "bool_", "age": "int32", "hits": "int32",
+    "heading": "float32", "front_probability": "float32", "velocity_x": "float32", "velocity_y": "float32",
+    "speed": "float32", "turn_rate": "float32", "lateral_shift_m": "float32",
+    "world_x": "float64", "world_y": "float64", "world_z": "float64",
+}  # fmt: skip
+"""Those of tracks, one row a track and sweep; the last three are the centre in the world of the poses, m."""
+
 SWEEPS_KEY = "jaxbox.sweeps"
 """Key of the file's metadata that lists every sweep."""
 
@@ -31,7 +44,11 @@ _BATCH_ROWS = 16384
 
 @contextlib.contextmanager
 def open_parquet(
-    path: pathlib.Path, resume: bool = False, *, metadata: Mapping[str, str] | None = None
+    path: pathlib.Path,
+    resume: bool = False,
+    *,
+    metadata: Mapping[str, str] | None = None,
+    columns: Mapping[str, str] = PARQUET_COLUMNS,
 ) -> Iterator[WriteResult]:
     """Opens a Parquet file for the boxes of a run; see the module for its columns.
 
@@ -39,6 +56,7 @@ def open_parquet(
       path: the file; its folder is made where it is missing.
       resume: whether the rows of an earlier file of that name come first.
       metadata: more of the file's metadata, taken when it ends.
+      columns: `PARQUET_COLUMNS`, or `TRACK_COLUMNS` for tracks.
 
     Yields:
       What adds a sweep. Rows are held until there are enough for a batch.
@@ -49,7 +67,7 @@ def open_parquet(
     """
     arrow = require("pyarrow", extra="arrow", what="Parquet files")
     parquet = require("pyarrow.parquet", extra="arrow", what="Parquet files")
-    schema = arrow.schema([(name, getattr(arrow, kind)()) for name, kind in PARQUET_COLUMNS.items()])
+    schema = arrow.schema([(name, getattr(arrow, kind)()) for name, kind in columns.items()])
     names = sorted(finished_parquet(path)) if resume else []
     rows: list[dict[str, Any]] = []
     with atomic_path(path) as temporary, parquet.ParquetWriter(temporary, schema) as writer:
@@ -90,10 +108,10 @@ def box_rows(record: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The rows of one sweep.
 
     Args:
-      record: as `jaxbox.io.detections_record` makes it.
+      record: as `jaxbox.io.detections_record` or `jaxbox.io.tracks_record` makes it.
 
     Returns:
-      One dictionary a box, with the keys `PARQUET_COLUMNS`.
+      One dictionary a box, with the keys `PARQUET_COLUMNS`, and of a track `TRACK_COLUMNS`.
     """
     return [
         {
@@ -105,9 +123,22 @@ def box_rows(record: Mapping[str, Any]) -> list[dict[str, Any]]:
             **dict(zip(("length", "width", "height"), box["size"], strict=True)),
             "yaw": box["yaw"],
             "num_points": box["num_points"],
+            **(_track_columns(record, box) if "id" in box else {}),
         }
         for box in record["boxes"]
     ]
+
+
+def _track_columns(record: Mapping[str, Any], box: Mapping[str, Any]) -> dict[str, Any]:
+    """What the row of a track has besides that of a box."""
+    same = ("id", "state", "sight", "confirmed", "age", "hits", "heading", "front_probability", "speed")
+    world = np.array(record["T_world_sensor"]) @ [*box["center"], 1.0]
+    return {
+        **{name: record[name] for name in ("sequence", "frame", "time_s")},
+        **{name: box[name] for name in (*same, "turn_rate", "lateral_shift_m")},
+        **dict(zip(("velocity_x", "velocity_y"), box["velocity"], strict=True)),
+        **dict(zip(("world_x", "world_y", "world_z"), world.tolist()[:3], strict=True)),
+    }
 
 
 def finished_parquet(path: pathlib.Path) -> frozenset[str]:
@@ -135,6 +166,35 @@ def finished_parquet(path: pathlib.Path) -> frozenset[str]:
         return frozenset(names)
     except (arrow.ArrowException, OSError, KeyError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: no Parquet file of jaxbox ({reason(error)}); move it away.") from error
+
+
+@contextlib.contextmanager
+def open_track_parquet(path: pathlib.Path, resume: bool = False) -> Iterator[WriteResult]:
+    """Opens a Parquet file for the tracks of a drive: `open_parquet` with `TRACK_COLUMNS`."""
+    with open_parquet(path, resume, columns=TRACK_COLUMNS) as write:
+        yield write
+
+
+@contextlib.contextmanager
+def open_track_csv(path: pathlib.Path, resume: bool = False) -> Iterator[WriteResult]:
+    """Opens a text file with a header and commas for the tracks of a drive; its columns are `TRACK_COLUMNS`.
+
+    Args:
+      path: the file; its folder is made where it is missing.
+      resume: must be False: a drive is written as a whole.
+
+    Yields:
+      What adds a sweep.
+
+    Raises:
+      ValueError: for `resume`.
+    """
+    if resume:
+        raise ValueError("a CSV file is not continued.")
+    with atomic_writer(path) as handle:
+        writer = csv.DictWriter(handle, list(TRACK_COLUMNS), lineterminator="\n")
+        writer.writeheader()
+        yield lambda result: writer.writerows(box_rows(result.record))
 
 
 PARQUET = ResultFile(name="detections.parquet", open=open_parquet, finished=finished_parquet)

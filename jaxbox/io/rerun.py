@@ -1,7 +1,8 @@
-"""Detections as a recording of the rerun viewer: points, boxes, and the image with the boxes' edges.
+"""Detections, or tracks, as a recording of the rerun viewer: points, boxes, and the image with their edges.
 
-Entities: ``world/points``, ``world/boxes``, ``camera/image`` and ``camera/boxes``; timelines ``sweep``, its
-number, and ``time``. ``rerun FILE.rrd`` shows it.
+Entities: ``world/points``, ``world/boxes``, ``camera/image`` and ``camera/boxes``, and of tracks
+``world/trails`` and ``world/velocities``; timelines ``sweep``, its number, and ``time``.
+``rerun FILE.rrd`` shows it.
 """
 
 import contextlib
@@ -15,7 +16,7 @@ import numpy as np
 from jaxbox._extras import require
 from jaxbox._files import atomic_path
 from jaxbox.geometry.projection import project_boxes
-from jaxbox.io.foxglove import COLORS
+from jaxbox.io.foxglove import caption_of, color_of
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
 from jaxbox.types import Calibration
 
@@ -76,14 +77,23 @@ def _log_world(rerun: Any, recording: Any, result: SweepResult) -> None:
         colors = (_LOW + share * (_HIGH - _LOW)).astype(np.uint8)
         recording.log("world/points", rerun.Points3D(xyz, colors=colors, radii=_POINT_RADIUS_M))
     center, size, yaw = _arrays(result.record)
-    boxes = rerun.Boxes3D(
+    boxes, colors = result.record["boxes"], _colors(result.record)
+    drawn = rerun.Boxes3D(
         centers=center,
         half_sizes=size / 2,
         quaternions=np.column_stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)]),
-        labels=[f"{box['label']} {box['score']:.2f}" for box in result.record["boxes"]],
-        colors=_colors(result.record),
+        labels=[caption_of(box) for box in boxes],
+        colors=colors,
     )
-    recording.log("world/boxes", boxes)
+    recording.log("world/boxes", drawn)
+    if result.trails is None:
+        return
+    trails = [result.trails.get(box["id"], np.zeros((0, 3))) for box in boxes]
+    recording.log("world/trails", rerun.LineStrips3D(trails, colors=colors))
+    is_moving = np.array([box["state"] != "standing" for box in boxes], bool)
+    velocity = np.array([[*box["velocity"], 0.0] for box in boxes]).reshape(-1, 3)
+    arrows = rerun.Arrows3D(origins=center[is_moving], vectors=velocity[is_moving], colors=colors[is_moving])
+    recording.log("world/velocities", arrows)
 
 
 def _log_camera(rerun: Any, recording: Any, result: SweepResult) -> None:
@@ -118,7 +128,7 @@ def _arrays(record: Mapping[str, Any]) -> tuple[np.ndarray, np.ndarray, np.ndarr
 
 
 def _colors(record: Mapping[str, Any]) -> np.ndarray:
-    colors = [COLORS.get(box["label"], (1.0, 1.0, 1.0)) for box in record["boxes"]]
+    colors = [color_of(box) for box in record["boxes"]]
     return (255 * np.array(colors).reshape(-1, 3)).astype(np.uint8)
 
 

@@ -18,13 +18,16 @@ from jaxbox.types import Calibration
 SWEEP_PERIOD_NS = 10**8
 """Time between sweeps whose own times are unknown: most sensors turn ten times a second."""
 
+_NS_PER_S = 10**9
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SweepResult:
     """What is written of one sweep."""
 
     record: Mapping[str, Any]
-    """As `jaxbox.io.detections_record` makes it: name, time, boxes, status, counts."""
+    """As `jaxbox.io.detections_record` or `jaxbox.io.tracks_record` makes it: name, time, boxes, status,
+    counts."""
     xyz: np.ndarray | None = None
     """(n, 3) float32, m, sensor frame; None leaves the points out."""
     intensity: np.ndarray | None = None
@@ -33,15 +36,19 @@ class SweepResult:
     """Of the camera; None where there is none."""
     image: np.ndarray | None = None
     """(h, w, 3) uint8, RGB; None where there is none."""
+    trails: Mapping[int, np.ndarray] | None = None
+    """Of tracks: for each id (m, 3) m, where it was lately, in this sweep's sensor frame; else None."""
 
     def time_ns(self, index: int) -> int:
-        """Its time, ns since 1970; for sweeps without one, as if ten a second had begun at 0.
+        """Its time, ns since 1970; for sweeps without one, from 0 as a tracker took them, or ten a second.
 
         Args:
           index: position among the sweeps of the file.
         """
-        known = self.record.get("timestamp_ns")
-        return index * SWEEP_PERIOD_NS if known is None else int(known)
+        known, time_s = self.record.get("timestamp_ns"), self.record.get("time_s")
+        if known is not None:
+            return int(known)
+        return index * SWEEP_PERIOD_NS if time_s is None else round(time_s * _NS_PER_S)
 
 
 WriteResult = Callable[[SweepResult], None]

@@ -14,6 +14,8 @@ from jaxbox.viz.judged import JudgedFrame, draw_judged_frame, group_by_verdict
 from jaxbox.viz.lidar_view import LidarCamera, draw_lidar_view
 from jaxbox.viz.plots import plot_dimensions, plot_residuals, save_figure
 from jaxbox.viz.stages import draw_stages
+from jaxbox.viz.tracks import draw_drive, draw_image_tracks, draw_tracks
+from jaxbox.viz.video import open_video
 
 __all__ = [
     "BirdEyeFrame",
@@ -24,12 +26,16 @@ __all__ = [
     "color_by_height",
     "color_by_id",
     "draw_bird_eye",
+    "draw_drive",
     "draw_image_boxes",
+    "draw_image_tracks",
     "draw_judged_frame",
     "draw_lidar_view",
     "draw_stages",
+    "draw_tracks",
     "group_by_verdict",
     "make_contact_sheet",
+    "open_video",
     "plot_dimensions",
     "plot_residuals",
     "save_figure",

@@ -3,6 +3,8 @@
 import dataclasses
 from collections.abc import Sequence
 
+import cv2
+import jax.numpy as jnp
 import numpy as np
 
 from jaxbox.types import Calibration
@@ -44,6 +46,28 @@ def draw_image_boxes(
     seen = [_draw_group(picture, calibration, group) for group in groups]
     draw_legend(picture, legend_entries(seen) if legend else [], title=title)
     return picture
+
+
+def scale_camera(
+    image: np.ndarray, calibration: Calibration, *, width_px: int
+) -> tuple[np.ndarray, Calibration]:
+    """An image of another width, and the camera that would have taken it.
+
+    Drawn on after scaling, lines and captions are the same at any size.
+
+    Args:
+      image: (h, w, 3) uint8.
+      calibration: of the camera that took it.
+      width_px: width of the image that is wanted.
+
+    Returns:
+      The image, of the same proportions, and the camera.
+    """
+    height, width = image.shape[:2]
+    scale = width_px / width
+    scaled = cv2.resize(image, (width_px, round(height * scale)), interpolation=cv2.INTER_AREA)
+    projection = jnp.diag(jnp.array([scale, scale, 1.0])) @ calibration.P_rect
+    return scaled, dataclasses.replace(calibration, P_rect=projection)
 
 
 def _draw_group(picture: np.ndarray, calibration: Calibration, group: BoxGroup) -> BoxGroup:

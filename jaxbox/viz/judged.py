@@ -3,8 +3,6 @@
 import dataclasses
 from collections.abc import Sequence
 
-import cv2
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbox.evaluation.iou import pairwise_overlaps
@@ -26,7 +24,7 @@ from jaxbox.viz.colors import (
     Color,
     shade_by_height,
 )
-from jaxbox.viz.image_boxes import draw_image_boxes
+from jaxbox.viz.image_boxes import draw_image_boxes, scale_camera
 
 FOUND_OVERLAP, TIGHT_OVERLAP = RATE_OVERLAPS
 """A label is found from this bird's-eye IoU on; its box fits from this 3D IoU on, KITTI's limit for cars."""
@@ -192,14 +190,11 @@ def draw_judged_frame(frame: JudgedFrame, *, width_px: int = 1242, legend: bool 
 
 
 def _draw_image(frame: JudgedFrame, width_px: int) -> np.ndarray:
-    """The boxes in the image, drawn after scaling it, so that lines and captions are the same at any size."""
+    """The boxes in the scaled image."""
     assert frame.image is not None
-    height, width = frame.image.shape[:2]
-    scale = width_px / width
-    image = cv2.resize(frame.image, (width_px, round(height * scale)), interpolation=cv2.INTER_AREA)
+    image, camera = scale_camera(frame.image, frame.calibration, width_px=width_px)
+    scale = width_px / frame.image.shape[1]
     for left, top, right, bottom in frame.regions_px * scale:
         corners = np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
         draw_polygon(image, corners, IGNORED, thickness_px=1)
-    projection = jnp.diag(jnp.array([scale, scale, 1.0])) @ frame.calibration.P_rect
-    camera = dataclasses.replace(frame.calibration, P_rect=projection)
     return draw_image_boxes(image, camera, groups=frame.groups, legend=False)

@@ -1,0 +1,69 @@
+"""Options that several commands share, and what they say at the end of their help."""
+
+import math
+import pathlib
+from typing import Annotated
+
+import typer
+
+from jaxbox.cli.config_options import complete_preset, complete_setting
+
+EXIT_CODES = (
+    "Exit codes: 0 all went well; 1 some sweeps failed or it was interrupted, the others are done; "
+    "2 the input or an option cannot be used, or results cannot be written."
+)
+
+PresetOption = Annotated[
+    str | None,
+    typer.Option(
+        help="Settings to start from: default, fast, or paper for the paper's choices.",
+        autocompletion=complete_preset,
+    ),
+]
+SensorOption = Annotated[
+    int | None,
+    typer.Option(
+        metavar="BEAMS", help="Fit the preset to a sensor: 16, 32, 64 or 128 beams; `info FILE` says which."
+    ),
+]
+SettingsOption = Annotated[
+    pathlib.Path | None,
+    typer.Option(
+        "--config",
+        "--settings",
+        help="Settings file: TOML, or JSON such as best.json of `tune`; docs/settings.md.",
+    ),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="FIELD=VALUE",
+        help="Change one setting by its name; repeatable.",
+        autocompletion=complete_setting,
+    ),
+]
+TopicOption = Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")]
+
+
+def _finite_position(position: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
+    if position is not None and not all(map(math.isfinite, position)):
+        raise typer.BadParameter(f"{' '.join(map(str, position))}: give three finite numbers, in metres.")
+    return position
+
+
+SensorAtOption = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option(
+        metavar="X Y Z",
+        callback=_finite_position,
+        help="Where the sensor is in the points' frame (m), if not at 0 0 0.",
+    ),
+]
+LevelOption = Annotated[
+    bool, typer.Option("--level", help="Measure how the sensor is tilted, and see the sweeps upright.")
+]
+CapacityOption = Annotated[
+    int | None,
+    typer.Option(min=1, help="Points a sweep is padded to; by default what it needs. One compile each."),
+]

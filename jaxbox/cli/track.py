@@ -1,0 +1,342 @@
+"""``jaxbox track``: drives to vehicles that have a history, one sequence after the other."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Generator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from jaxbox import io
+from jaxbox.cli.console import (
+    ExitCode,
+    make_progress,
+    print_error,
+    print_warning,
+    stderr,
+    stdout,
+    stoppable,
+    undisturbed,
+)
+from jaxbox.cli.inputs import RunOptions, prepare_run, print_json, reasons_as_json
+from jaxbox.cli.kept import KeptSweep
+from jaxbox.cli.results import RunAccount
+from jaxbox.cli.track_report import SequenceReport, TrackReport
+from jaxbox.cli.track_results import SequenceFiles, TrackFormat
+from jaxbox.config import TrackConfig
+from jaxbox.config.fields import all_fields
+from jaxbox.io.results import SweepResult
+from jaxbox.run.carrier import without_points
+from jaxbox.run.tracking import TrackedSweep, smooth_tracks, track
+from jaxbox.tracking.poses import Poses, PoseSource
+from jaxbox.tracking.tracks import TrackStatus
+from jaxbox.tracking.trails import Trails
+from jaxbox.viz import draw_drive
+
+AUTO = "auto"
+"""Poses that the data set or recording holds, else those of kiss-icp or of the boxes."""
+ESTIMATED = (PoseSource.KISS_ICP, PoseSource.BOXES, PoseSource.NONE)
+"""Words that `--poses` takes besides a file."""
+_NS_PER_S = 10**9
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrackOptions(RunOptions):
+    """The options of ``jaxbox track``; the command's help explains them."""
+
+    track_config: TrackConfig
+    """The tracker's settings."""
+    formats: frozenset[TrackFormat]
+    """What to write."""
+    poses: str
+    """`AUTO`, a word of `ESTIMATED`, or a file or folder."""
+    rate_hz: float
+    """Sweeps a second where nothing says when they were taken."""
+    max_tracks: int
+    """Vehicles at a time."""
+    smooth: bool
+    """Whether the whole drive is looked at before anything is written."""
+    confirmed: bool
+    """Whether tracks that are not confirmed are left out."""
+    coasting: bool
+    """Whether KITTI text holds tracks too that were not detected in the sweep."""
+    points: bool
+    """Whether MCAP and rerun files hold the points too."""
+    pictures: bool
+    """Whether each sweep is drawn."""
+    video: bool
+    """Whether there is a video of each drive."""
+
+    def recorded(self) -> dict:
+        """What the results depend on besides the detector's settings, as JSON can hold it."""
+        names = ("poses", "rate_hz", "max_tracks", "smooth", "confirmed", "coasting")
+        settings = {name: float(value) for name, value in all_fields(self.track_config).items()}
+        return {"track": settings} | {name: getattr(self, name) for name in names}
+
+    def files_of(self, sequence: str) -> SequenceFiles:
+        """The files of a sequence."""
+        return SequenceFiles(
+            self.output,
+            sequence,
+            self.formats,
+            # A gap that is filled between two detections is what smoothing is for.
+            coasting=self.coasting or self.smooth,
+            points=self.points,
+            pictures=self.pictures,
+            video=self.video,
+        )
+
+
+def run_track(paths: Sequence[str], options: TrackOptions) -> ExitCode:
+    """Tracks the vehicles of every sequence of some paths.
+
+    A broken sweep is reported and the others go on. Interrupted (Ctrl-C or SIGTERM), or where a recording
+    breaks off, what is done of the sequence is written, and ``--resume`` begins it again.
+
+    Args:
+      paths: what `jaxbox.io.open_sweeps` takes.
+      options: the command's options.
+
+    Returns:
+      `ExitCode.FRAME_FAILED` where a sweep failed, or it was interrupted.
+
+    Raises:
+      InputError: where a path holds no sweeps, or the options cannot be used.
+    """
+    sweeps, account = prepare_run(paths, options, more=options.recorded())
+    if len(sweeps) == 0:
+        raise io.InputError(f"{', '.join(paths)}: no sweeps there; the recording is empty.")
+    sequences = io.group_sequences(sweeps)
+    earlier = account.earlier_incomplete() if options.resume else None
+    run, start = TrackReport(), time.perf_counter()
+    pending = [name for name, group in sequences if not _is_finished(name, group, options, earlier)]
+    account.write(finished=False, incomplete=pending)
+    with stoppable(), make_progress(shown=options.speaks) as progress:
+        task = progress.add_task("tracking", total=len(sweeps))
+        for name, group in sequences:
+            if name not in pending:
+                run.num_skipped += len(group)
+                progress.advance(task, len(group))
+                continue
+            report = SequenceReport(name)
+            run.sequences.append(report)
+            _run_sequence(group, report, options, lambda: progress.advance(task))
+            if report.is_complete:
+                pending.remove(name)
+            _write_account(account, run, pending)
+            _describe_sequence(report, options)
+            if report.interrupted:
+                break
+    _describe_run(run, options, time.perf_counter() - start)
+    return ExitCode.FRAME_FAILED if run.failures or run.interrupted else ExitCode.OK
+
+
+def _is_finished(
+    name: str, sweeps: Sequence[io.Sweep], options: TrackOptions, earlier: frozenset[str] | None
+) -> bool:
+    """Whether an earlier run has done a whole sequence; `earlier` are those that it has not."""
+    if earlier is None or name in earlier or len(sweeps) == 0:
+        return False
+    return options.files_of(name).are_there(has_camera=sweeps[0].calibration_path is not None)
+
+
+def _write_account(account: RunAccount, run: TrackReport, pending: Sequence[str]) -> None:
+    account.write(
+        finished=not (pending or run.interrupted),
+        interrupted=run.interrupted,
+        incomplete=list(pending),
+        num_done=run.num_done,
+        num_skipped=run.num_skipped,
+        failures=reasons_as_json(run.failures),
+        sequences=[sequence.to_json() for sequence in run.sequences],
+    )
+
+
+def _run_sequence(
+    sweeps: Sequence[io.Sweep], report: SequenceReport, options: TrackOptions, advance: Callable[[], None]
+) -> None:
+    """One sequence and its files."""
+    if len(sweeps) == 0:
+        _fail(report, report.name, "no sweeps in it; the recording is empty.")
+        return
+    with options.files_of(report.name) as files:
+        _Drive(sweeps, report, options, files, advance).go()
+        report.has_camera = files.has_camera
+    report.is_complete = not (report.failures or report.interrupted)
+
+
+def _fail(report: SequenceReport, name: str, reason: str) -> None:
+    report.failures.append((name, reason))
+    print_error(f"{name}: {reason}")
+
+
+class _Drive:
+    """The way of one sequence from its sweeps to its files."""
+
+    def __init__(
+        self,
+        sweeps: Sequence[io.Sweep],
+        report: SequenceReport,
+        options: TrackOptions,
+        files: SequenceFiles,
+        advance: Callable[[], None],
+    ) -> None:
+        self._sweeps, self._report, self._options = sweeps, report, options
+        self._files, self._advance = files, advance
+        self._trails = Trails()
+        self._start_ns: int | None = None
+
+    def go(self) -> None:
+        """Tracks and writes; ends early, with what is done, where it is interrupted or breaks off."""
+        kept: list[tuple[int, TrackedSweep]] = []
+        source = self._track()
+        try:
+            for index, tracked in enumerate(source):
+                if tracked.error is not None:
+                    _fail(self._report, tracked.name, tracked.error)
+                elif self._options.smooth:
+                    kept.append((index, _light(tracked)))
+                else:
+                    self._write(index, tracked)
+                self._advance()
+        except io.InputError as error:
+            _fail(self._report, self._report.name, str(error))
+        except KeyboardInterrupt:
+            self._report.interrupted = True
+        finally:
+            source.close()
+        smoothed = smooth_tracks([tracked for _, tracked in kept], self._options.track_config)
+        for (index, _), tracked in zip(kept, smoothed, strict=True):
+            self._write(index, tracked)
+
+    def _track(self) -> Generator[TrackedSweep, None, None]:
+        # Results and pictures show points that were read anyway.
+        keeps = self._files.wants_points
+        options = self._options
+        return track(
+            (KeptSweep(sweep, keeps=keeps) for sweep in self._sweeps),
+            options.config,
+            options.track_config,
+            poses=self._find_poses(),
+            capacity=options.capacity,
+            max_tracks=options.max_tracks,
+            rate_hz=options.rate_hz,
+            workers=options.jobs,
+        )
+
+    def _find_poses(self) -> Poses | PoseSource | None:
+        asked = self._options.poses
+        if asked in ESTIMATED:
+            return PoseSource(asked)
+        path = None if asked == AUTO else asked
+        try:
+            found = io.find_poses(self._sweeps, poses_path=path, report=self._tell)
+        except io.InputError as error:
+            if path is not None:
+                raise
+            # Poses of its own are a convenience: without them it goes as for a recording that has none.
+            print_warning(f"{self._report.name}: {error} Poses are estimated instead.")
+            return None
+        if found is None and path is not None:
+            raise io.InputError(f"--poses {path}: no poses of {self._report.name} there.")
+        return found
+
+    def _tell(self, sentence: str) -> None:
+        if self._options.speaks:
+            stdout().print(f"{self._report.name}: {sentence}", markup=False)
+
+    def _write(self, index: int, tracked: TrackedSweep) -> None:
+        """Adds a sweep to the files; a failure to read what belongs to it is one of the sweep."""
+        kept = tracked.sweep
+        assert isinstance(kept, KeptSweep)
+        frame = index if kept.frame is None else kept.frame
+        if self._start_ns is None:
+            self._start_ns = tracked.time_ns
+        record = io.tracks_record(
+            tracked,
+            sequence=self._report.name,
+            frame=frame,
+            time_s=(tracked.time_ns - self._start_ns) / _NS_PER_S,
+            min_score=self._options.min_score,
+            confirmed=self._options.confirmed,
+        )
+        try:
+            result = self._gather(kept, tracked, record)
+        except (io.InputError, OSError) as error:
+            _fail(self._report, tracked.name, str(error))
+            return
+        picture = self._draw(tracked, result) if self._files.wants_pictures else None
+        with undisturbed():
+            self._files.write(result)
+            if picture is not None:
+                self._files.add_picture(tracked.name, picture, tracked.time_ns)
+        self._report.add(tracked, record, min_score=self._options.shown_min_score)
+        if self._options.json:
+            print_json({**record, "num_points": tracked.num_points})
+
+    def _gather(self, kept: KeptSweep, tracked: TrackedSweep, record: Mapping[str, Any]) -> SweepResult:
+        """What belongs to a sweep, as far as the files show it."""
+        xyz, intensity = kept.take_points() if self._files.wants_points else (None, None)
+        trails: Mapping[int, np.ndarray] = {}
+        is_new = TrackStatus.TIME_NOT_LATER not in tracked.status
+        if is_new and tracked.tracks is not None and tracked.T_world_sensor is not None:
+            trails = self._trails.add(tracked.tracks, tracked.T_world_sensor, record["time_s"])
+        return SweepResult(
+            record=record,
+            xyz=xyz,
+            intensity=intensity,
+            calibration=kept.sweep.read_calibration(),
+            image=kept.sweep.read_image() if self._files.wants_image else None,
+            trails=trails,
+        )
+
+    def _draw(self, tracked: TrackedSweep, result: SweepResult) -> np.ndarray:
+        assert tracked.tracks is not None
+        assert result.xyz is not None
+        record = result.record
+        return draw_drive(
+            result.xyz,
+            tracked.tracks,
+            image=result.image,
+            calibration=result.calibration,
+            trails=result.trails,
+            title=f"{tracked.name}  {record['time_s']:.1f} s  poses: {record['pose_source']}",
+            min_score=self._options.shown_min_score,
+        )
+
+
+def _light(tracked: TrackedSweep) -> TrackedSweep:
+    """A sweep that can be kept until its drive is over: without points."""
+    assert tracked.detections is not None
+    assert isinstance(tracked.sweep, KeptSweep)
+    tracked.sweep.forget_points()
+    return dataclasses.replace(tracked, detections=without_points(tracked.detections))
+
+
+def _describe_sequence(report: SequenceReport, options: TrackOptions) -> None:
+    if not options.quiet:
+        for sentence in report.warnings():
+            print_warning(sentence)
+    if options.speaks:
+        stdout().print(report.describe(), markup=False)
+
+
+def _describe_run(run: TrackReport, options: TrackOptions, elapsed_s: float) -> None:
+    """The end of the run, in sentences or as the last line of JSON."""
+    if run.interrupted:
+        stderr().print("interrupted; the same command with --resume goes on.", markup=False)
+    without = [sequence.name for sequence in run.sequences if not sequence.has_camera]
+    if without:
+        stderr().print(
+            f"{len(without)} sequences have no camera calibration (the first is {without[0]}); KITTI text "
+            "needs one, so their tracks are in JSON Lines instead.",
+            markup=False,
+        )
+    if options.json:
+        counts = {"done": run.num_done, "skipped": run.num_skipped, "interrupted": run.interrupted}
+        sequences = [sequence.to_json() for sequence in run.sequences]
+        summary = {**counts, "failures": reasons_as_json(run.failures), "sequences": sequences}
+        print_json({"summary": summary})
+    elif options.speaks:
+        for line in run.describe(elapsed_s):
+            stdout().print(line, markup=False)

@@ -1,0 +1,162 @@
+"""Options of ``jaxbox track``."""
+
+import pathlib
+from typing import Annotated
+
+import typer
+
+from jaxbox.cli.config_options import chosen_config, chosen_track_config, complete_track_setting
+from jaxbox.cli.console import input_errors
+from jaxbox.cli.options import (
+    CapacityOption,
+    LevelOption,
+    PresetOption,
+    SensorAtOption,
+    SensorOption,
+    SetOption,
+    SettingsOption,
+    TopicOption,
+)
+from jaxbox.cli.report import SHOWN_MIN_SCORE
+from jaxbox.cli.track import AUTO, ESTIMATED, TrackOptions, run_track
+from jaxbox.cli.track_results import TrackFormat
+from jaxbox.run.tracking import MAX_TRACKS, RATE_HZ
+
+TRACK_EXAMPLES = """Examples:
+
+jaxbox track KITTI/training --output tracks --video
+
+jaxbox track drive.mcap --output tracks --format jsonl --format mcap --smooth
+
+jaxbox track drive.bag --output tracks --poses odometry.txt --format csv
+
+jaxbox track 'sweeps/*.pcd' --output tracks --rate-hz 20 --poses boxes --track-set max_misses=6
+
+"""
+
+
+def complete_poses(incomplete: str) -> list[str]:
+    """Words that a shell proposes for ``--poses``.
+
+    >>> complete_poses("b")
+    ['boxes']
+    """
+    return [word for word in (AUTO, *map(str, ESTIMATED)) if word.startswith(incomplete)]
+
+
+def track(
+    paths: Annotated[
+        list[str], typer.Argument(help="What `detect` takes; each folder or recording is a drive.")
+    ],
+    *,
+    output: Annotated[pathlib.Path, typer.Option(metavar="FOLDER", help="For results, pictures and videos.")],
+    poses: Annotated[
+        str,
+        typer.Option(
+            metavar="auto|kiss-icp|boxes|none|FILE",
+            help="Where the sensor was. auto: what the data set or recording holds, else kiss-icp (extra "
+            "track), else the boxes. FILE: a text file, or a folder of one a drive; docs/formats.md.",
+            autocompletion=complete_poses,
+        ),
+    ] = AUTO,
+    rate_hz: Annotated[
+        float, typer.Option(help="Sweeps a second, where nothing says when they were taken.")
+    ] = RATE_HZ,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="Look at the whole drive first: smoother, and gaps are filled.")
+    ] = False,
+    result_format: Annotated[
+        list[TrackFormat] | None,
+        typer.Option("--format", help="What to write; repeatable. By default kitti."),
+    ] = None,
+    video: Annotated[
+        bool, typer.Option("--video", help="A video of each drive: from above, and the camera's image.")
+    ] = False,
+    pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw each sweep.")] = False,
+    points: Annotated[
+        bool, typer.Option("--points/--no-points", help="Put the points into MCAP and rerun files too.")
+    ] = True,
+    confirmed: Annotated[
+        bool,
+        typer.Option(
+            "--confirmed/--all", help="Write only vehicles that were found often enough, or all of them."
+        ),
+    ] = False,
+    coasting: Annotated[
+        bool,
+        typer.Option(
+            "--coasting",
+            help="KITTI text holds vehicles too that are hidden or were missed in the sweep. The other "
+            "formats say which these are; with --smooth text has them in any case.",
+        ),
+    ] = False,
+    min_score: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            max=1.0,
+            help=f"Leave out lower scores; pictures never show less than {SHOWN_MIN_SCORE:g}.",
+        ),
+    ] = 0.0,
+    preset: PresetOption = None,
+    sensor: SensorOption = None,
+    settings: SettingsOption = None,
+    changes: SetOption = None,
+    track_changes: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--track-set",
+            metavar="FIELD=VALUE",
+            help="Change one setting of the tracker by its name; repeatable.",
+            autocompletion=complete_track_setting,
+        ),
+    ] = None,
+    max_tracks: Annotated[int, typer.Option(min=1, help="Vehicles at a time.")] = MAX_TRACKS,
+    topic: TopicOption = None,
+    sensor_at: SensorAtOption = None,
+    level: LevelOption = False,
+    capacity: CapacityOption = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that detect; results do not depend on it.")] = 1,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Pass over drives whose results in OUTPUT are complete.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print only what went wrong.")] = False,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object a sweep, and a summary, for scripts.")
+    ] = False,
+) -> None:
+    """Follow vehicles through drives: ids, velocities, headings, and what they do.
+
+    Results are OUTPUT/DRIVE.txt (kitti), .jsonl, .parquet, .csv, .mcap (for Foxglove), .rrd (for rerun) and
+    .mp4, pictures OUTPUT/pictures/SWEEP_tracks.png. Every file is written whole or not at all. The exact
+    settings are in OUTPUT/config.toml, those of the tracker, versions and failures in OUTPUT/run.json. A
+    broken sweep is reported and the others go on; of an interrupted drive there is what was done.
+    """
+    with input_errors():
+        if not rate_hz > 0:
+            raise typer.BadParameter(f"--rate-hz is {rate_hz:g}; give sweeps a second, such as 10.")
+        options = TrackOptions(
+            output=output,
+            config=chosen_config(preset, settings, changes or [], sensor=sensor),
+            track_config=chosen_track_config(track_changes or []),
+            formats=frozenset(result_format or [TrackFormat.KITTI]),
+            poses=poses,
+            rate_hz=rate_hz,
+            max_tracks=max_tracks,
+            smooth=smooth,
+            confirmed=confirmed,
+            coasting=coasting,
+            topic=topic,
+            sensor_at=sensor_at,
+            level=level,
+            capacity=capacity,
+            min_score=min_score,
+            points=points,
+            pictures=pictures,
+            video=video,
+            jobs=jobs,
+            resume=resume,
+            quiet=quiet,
+            json=json,
+        )
+        raise typer.Exit(run_track(paths, options))

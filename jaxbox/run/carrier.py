@@ -1,0 +1,278 @@
+"""Where the sensor was and when, sweep by sweep: from given poses, the points, the boxes, or nowhere.
+
+A source of poses is asked for each sweep twice: before it is detected, when it may read the points or take
+their distortion away, and after it, when the boxes are there.
+"""
+
+import dataclasses
+import importlib.util
+from collections.abc import Iterable, Iterator
+from typing import Any, Protocol
+
+import numpy as np
+
+from jaxbox.geometry.rigid import relative_rigid
+from jaxbox.run.streaming import ReadableSweep
+from jaxbox.tracking.odometry import KissIcp, ego_motion_from_boxes
+from jaxbox.tracking.poses import Poses, PoseSource, check_pose, deskew
+from jaxbox.types import Detections
+
+_NS_PER_S = 10**9
+
+
+class Carrier(Protocol):
+    """A source of poses for the sweeps of one sequence."""
+
+    source: PoseSource
+    """Where the poses are from."""
+
+    def prepare(self, index: int, sweep: ReadableSweep) -> ReadableSweep:
+        """The sweep as it is to be read for the detector; called in the order of the sweeps, some ahead."""
+        ...
+
+    def locate(self, index: int, detections: Detections) -> np.ndarray:
+        """T_world_sensor, (4, 4) float64; called in the order of the sweeps, for those that were read."""
+        ...
+
+
+def make_carrier(poses: Poses | np.ndarray | PoseSource | str | None) -> Carrier:
+    """The source of poses that was asked for.
+
+    Args:
+      poses: those of all sweeps, (F, 4, 4) T_world_sensor or `Poses`; or "kiss-icp", "boxes" or "none"; None
+        for kiss-icp where it is installed, else the boxes.
+
+    Returns:
+      The source.
+
+    Raises:
+      ValueError: for another word, or another shape.
+      ImportError: for "kiss-icp" without the extra ``track``.
+    """
+    if poses is None:
+        poses = PoseSource.KISS_ICP if importlib.util.find_spec("kiss_icp") else PoseSource.BOXES
+    if isinstance(poses, str):
+        if poses not in _ESTIMATED:
+            raise ValueError(f"poses is {poses!r}; give an array, or one of {', '.join(_ESTIMATED)}.")
+        return _ESTIMATED[PoseSource(poses)]()
+    return GivenPoses(poses if isinstance(poses, Poses) else Poses(poses, PoseSource.POSE_FILE))
+
+
+class GivenPoses:
+    """Poses that are known, one a sweep; points that carry times lose their distortion by them."""
+
+    def __init__(self, poses: Poses) -> None:
+        self.source = poses.source
+        self._T_world_sensor = np.asarray(poses.T_world_sensor, np.float64)
+
+    def prepare(self, index: int, sweep: ReadableSweep) -> ReadableSweep:
+        """The sweep, whose points are moved to where they were at its own time.
+
+        Raises:
+          ValueError: for more sweeps than poses.
+        """
+        count = len(self._T_world_sensor)
+        if index >= count:
+            raise ValueError(f"{count} poses for more sweeps than that, such as {sweep.name}; give one each.")
+        first = min(index, max(count - 2, 0))
+        pair = self._T_world_sensor[first : first + 2]
+        if len(pair) < 2 or any(check_pose(T) for T in pair):
+            return sweep
+        return Deskewed(sweep, relative_rigid(pair[0], pair[1]))
+
+    def locate(self, index: int, detections: Detections) -> np.ndarray:
+        """The pose as it was given, which may be no pose at all."""
+        return self._T_world_sensor[index]
+
+
+class RegisteredPoints:
+    """Poses from the points, by kiss-icp. It reads each sweep before its turn."""
+
+    source = PoseSource.KISS_ICP
+
+    def __init__(self) -> None:
+        self._odometry = KissIcp()
+        self._T_world_sensor: dict[int, np.ndarray] = {}
+
+    def prepare(self, index: int, sweep: ReadableSweep) -> ReadableSweep:
+        """The sweep with its points, which are read and registered now; a broken one stays as it is."""
+        try:
+            xyz, intensity, time_s = read_timed(sweep)
+            before = self._T_world_sensor.get(index - 1)
+            T_world_sensor = self._odometry.register(xyz, time_s)
+        except Exception:
+            # Reading it for the detector says why, and the others go on.
+            return sweep
+        self._T_world_sensor[index] = T_world_sensor
+        if time_s is not None and before is not None:
+            xyz = deskew(xyz, time_s, relative_rigid(before, T_world_sensor))
+        return ReadSweep(sweep.name, xyz, intensity)
+
+    def locate(self, index: int, detections: Detections) -> np.ndarray:
+        """The pose that was found, which is then forgotten."""
+        T_world_sensor = self._T_world_sensor[index]
+        for earlier in [item for item in self._T_world_sensor if item < index]:
+            del self._T_world_sensor[earlier]
+        return T_world_sensor
+
+
+class RegisteredBoxes:
+    """Poses from the detector's own boxes, most of which stand."""
+
+    source = PoseSource.BOXES
+
+    def __init__(self) -> None:
+        self._motion = self._T_world_sensor = np.eye(4)
+        self._before: Detections | None = None
+
+    def prepare(self, index: int, sweep: ReadableSweep) -> ReadableSweep:
+        """The sweep as it is."""
+        return sweep
+
+    def locate(self, index: int, detections: Detections) -> np.ndarray:
+        """The pose before, and the motion since then."""
+        if self._before is not None:
+            self._motion, _ = ego_motion_from_boxes(self._before, detections, self._motion)
+            self._T_world_sensor = self._T_world_sensor @ self._motion
+        self._before = without_points(detections)
+        return self._T_world_sensor
+
+
+class Standing:
+    """No poses: the sensor is taken to stand."""
+
+    source = PoseSource.NONE
+
+    def prepare(self, index: int, sweep: ReadableSweep) -> ReadableSweep:
+        """The sweep as it is."""
+        return sweep
+
+    def locate(self, index: int, detections: Detections) -> np.ndarray:
+        """The identity."""
+        return np.eye(4)
+
+
+_ESTIMATED = {
+    PoseSource.KISS_ICP: RegisteredPoints,
+    PoseSource.BOXES: RegisteredBoxes,
+    PoseSource.NONE: Standing,
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class ReadSweep:
+    """A sweep whose points are at hand."""
+
+    name: str
+    """Of the sweep."""
+    xyz: np.ndarray
+    """(n, 3) float32, m, sensor frame."""
+    intensity: np.ndarray | None
+    """(n,) float32, or None."""
+
+    def read_points(self) -> tuple[np.ndarray, np.ndarray | None]:
+        """The points."""
+        return self.xyz, self.intensity
+
+
+@dataclasses.dataclass(frozen=True)
+class Deskewed:
+    """A sweep whose points are moved to where they were at its own time, where they carry times."""
+
+    sweep: ReadableSweep
+    """As it lies in its file."""
+    T_start_end: np.ndarray
+    """(4, 4) float64: the way of the sensor to the next sweep."""
+
+    @property
+    def name(self) -> str:
+        """Of the sweep."""
+        return self.sweep.name
+
+    def read_points(self) -> tuple[np.ndarray, np.ndarray | None]:
+        """Reads the points and moves them."""
+        xyz, intensity, time_s = read_timed(self.sweep)
+        return (xyz if time_s is None else deskew(xyz, time_s, self.T_start_end)), intensity
+
+
+def read_timed(sweep: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """Reads the points of a sweep and, where it has them, their times.
+
+    Args:
+      sweep: of any kind.
+
+    Returns:
+      xyz, intensity, and (n,) s since the sweep's time; None for the latter where the points carry no times,
+      or are compensated.
+    """
+    if not hasattr(sweep, "read_timed_points"):
+        return *sweep.read_points(), None
+    points = sweep.read_timed_points()
+    return points.xyz, points.intensity, None if points.is_compensated else points.time_s
+
+
+def without_points(detections: Detections) -> Detections:
+    """Detections without what they say of each point, so that sweeps of any capacity are one shape.
+
+    Args:
+      detections: on the host.
+
+    Returns:
+      The same boxes.
+    """
+    none = np.zeros(0, np.int32)
+    return dataclasses.replace(
+        detections, ground_mask=none.astype(bool), point_component=none, point_detection=none
+    )
+
+
+class Clock:
+    """When sweeps were taken: by their own times, else by the poses', else by their number."""
+
+    def __init__(self, rate_hz: float, times_ns: Iterable[int] | None) -> None:
+        """Starts at 0.
+
+        Raises:
+          ValueError: for a rate that is not positive.
+        """
+        if not rate_hz > 0:
+            raise ValueError(f"rate_hz is {rate_hz}; it must be positive.")
+        self._period_ns = _NS_PER_S / rate_hz
+        self._times_ns = None if times_ns is None else [int(time) for time in times_ns]
+        self._offset_ns = 0
+
+    def read(self, index: int, sweep: Any) -> int:
+        """The time of a sweep.
+
+        Args:
+          index: of the sweep in its sequence.
+          sweep: with a ``timestamp_ns``, or a ``frame`` that counts the sweeps of its sequence, or neither.
+
+        Returns:
+          ns. A sweep without a time comes as many periods after the last one with a time as numbers say.
+        """
+        known = getattr(sweep, "timestamp_ns", None)
+        if known is None and self._times_ns is not None:
+            known = self._times_ns[index]
+        frame = getattr(sweep, "frame", None)
+        counted = round((index if frame is None else frame) * self._period_ns)
+        if known is None:
+            return self._offset_ns + counted
+        self._offset_ns = known - counted
+        return known
+
+
+def prepared(sweeps: Iterable[ReadableSweep], carrier: Carrier, begun: Any) -> Iterator[ReadableSweep]:
+    """Hands sweeps out as they are to be read, and notes the sweeps themselves.
+
+    Args:
+      sweeps: of one sequence.
+      carrier: source of the poses.
+      begun: a deque, to which each sweep is added when it is handed out.
+
+    Yields:
+      What `stream` reads.
+    """
+    for index, sweep in enumerate(sweeps):
+        begun.append(sweep)
+        yield carrier.prepare(index, sweep)
