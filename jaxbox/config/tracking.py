@@ -31,7 +31,7 @@ class TrackConfig:
     max_misses: Scalar = 4.0
     """Sweeps in which a track may miss its detection though it would be visible."""
     max_hidden: Scalar = 30.0
-    """Sweeps in which a track may be hidden behind something else."""
+    """Sweeps in which a track may be hidden behind something else, but in no more than it was detected."""
     hidden_share: Scalar = 0.5
     """A track is hidden where more than this share of the azimuths over its box has a nearer return,"""
     hidden_gap_m: Scalar = 0.7

@@ -318,7 +318,8 @@ def forget(tracker: Tracker, first_return_m: np.ndarray, config: TrackConfig) ->
         track.hidden_now = is_hidden(track, first_return_m, config)
         track.hidden += track.hidden_now
         is_gone = track.misses - track.hidden > float(config.max_misses)
-        if is_gone or track.hidden > float(config.max_hidden) or track.hits < float(config.confirm_hits):
+        is_gone |= track.hidden > min(float(config.max_hidden), track.hits)
+        if is_gone or track.hits < float(config.confirm_hits):
             tracker.slots[slot] = None
 
 

@@ -221,7 +221,9 @@ def forget(slots: Slots, first_return_m: jax.Array, config: TrackConfig) -> Slot
     hidden = is_hidden(slots.position, size, slots.yaw, first_return_m, config) & is_missed
     num_hidden = slots.hidden + hidden.astype(jnp.int32)
     num_visible = (slots.misses - num_hidden).astype(jnp.float32)
-    lives = (num_visible <= config.max_misses) & (num_hidden.astype(jnp.float32) <= config.max_hidden)
+    # What was seen twice has no velocity to be followed for seconds.
+    max_hidden = jnp.minimum(config.max_hidden, slots.hits.astype(jnp.float32))
+    lives = (num_visible <= config.max_misses) & (num_hidden.astype(jnp.float32) <= max_hidden)
     lives = ~is_missed | (lives & _is_confirmed(slots, config))
     remembered = dataclasses.replace(slots, hidden=num_hidden, hidden_now=hidden)
     return _where(lives & slots.alive, remembered, empty_slots(slots.id.shape[0]))
