@@ -10,7 +10,8 @@ from typing import Any
 
 import jaxbox
 from jaxbox.evaluation.corruptions import CORRUPTIONS
-from jaxbox.types import Counts, Status
+from jaxbox.tracking import TrackConfig, Tracks, TrackStatus, motion
+from jaxbox.types import Counts, Motion, Status
 
 PROJECT = pathlib.Path(__file__).parents[2]
 RESULTS = {
@@ -339,17 +340,122 @@ def mounting() -> str:
 
 def status() -> str:
     """Every bit and its sentence."""
-    bits = [bit for bit in Status if bit.value]
-    rows = [(f"`{bit.name}`", bit.value, bit.describe()[0].partition(": ")[2]) for bit in bits]
+    return table_of_bits(Status)
+
+
+def track_status() -> str:
+    """Every bit of the tracker and its sentence."""
+    return table_of_bits(TrackStatus)
+
+
+def table_of_bits(kind: type[Status] | type[TrackStatus]) -> str:
+    """Name, value and sentence of each bit."""
+    rows = [(f"`{b.name}`", b.value, b.describe()[0].partition(": ")[2]) for b in kind if b.value]
     return table(["bit", "value", "what happened, and the fix"], rows)
 
 
 def counts() -> str:
     """The fields of `Counts` and what they count."""
-    source = inspect.getsource(Counts)
-    texts = dict(re.findall(r'^    (\w+): jax\.Array\n    """(.*?)"""', source, re.MULTILINE | re.DOTALL))
-    rows = [(f"`{f.name}`", " ".join(texts[f.name].split())) for f in dataclasses.fields(jaxbox.types.Counts)]
-    return table(["count", ""], rows)
+    return table(["count", ""], field_texts(Counts))
+
+
+def track_fields() -> str:
+    """The fields of `Tracks` and what they mean, those that hold further fields apart."""
+    rows = [row for row in field_texts(Tracks) if row[0] not in ("`counts`", "`status`")]
+    return table(["field", "shape, type, unit and frame, and meaning"], rows)
+
+
+def field_texts(kind: type) -> list[tuple[str, str]]:
+    """The arrays of a dataclass, each with the string that stands under it, which only the source has."""
+    source = inspect.getsource(kind)
+    pattern = r'^    (\w+): (?:jax\.Array|TrackCounts)\n    """(.*?)"""'
+    texts = dict(re.findall(pattern, source, re.MULTILINE | re.DOTALL))
+    return [(f"`{f.name}`", " ".join(texts[f.name].split())) for f in dataclasses.fields(kind)]
+
+
+def track_settings() -> str:
+    """Every setting of the tracker."""
+    rows = [
+        (name.replace("track.", ""), value, meaning)
+        for name, value, _, _, meaning in setting_rows(TrackConfig(), "track")
+    ]
+    return table(["setting", "default", "meaning"], rows)
+
+
+def motion_states() -> str:
+    """Every state of motion and when a track is in it; the later ones take precedence."""
+    c, second = TrackConfig(), f"{motion.MEMORY_S:g} s"
+    texts = {
+        Motion.STANDING: "does not move",
+        Motion.MOVING: f"faster than {c.moving_speed_mps:g} m/s and than {motion.SPEED_SDS:g} standard "
+        f"deviations of its speed, until it is slower than {c.standing_speed_mps:g} m/s",
+        Motion.STARTING: f"moves, faster by more than {c.starting_mps2:g} m/s² than {second} ago, when it "
+        f"was slower than {motion.STARTING_SPEED_MPS:g} m/s",
+        Motion.STOPPING: f"moves, slower by more than {c.starting_mps2:g} m/s² than {second} ago, and than "
+        f"{motion.STOPPING_SPEED_MPS:g} m/s",
+        Motion.TURNING: f"moved for {second} and is faster than {motion.TURNING_SPEED_MPS:g} m/s, and its "
+        f"course changed by more than {c.turning_deg_per_s:g} degrees a second",
+        Motion.LANE_CHANGE: f"moved for {motion.LANE_S:g} s, its courses at both ends agree within "
+        f"{c.lane_course_deg:g} degrees, and its path ends more than {c.lane_change_m:g} m to the side of "
+        "either; `lateral_shift_m` has the metres, positive to its left",
+    }
+    rows = [(state.name.lower().replace("_", " "), f"`{state.name}`", text) for state, text in texts.items()]
+    return table(["state", "`jaxbox.Motion`", "when"], rows)
+
+
+def tracking() -> str:
+    """Single sweeps, tracks and smoothed tracks side by side: the parts that were recorded."""
+    if "tracking" not in RESULTS:
+        return "*Not recorded yet.*"
+    report = load("tracking")
+    parts = [part(report[name]) for name, part in TRACKING_PARTS.items() if name in report]
+    return "\n\n".join(parts) + made_with(report)
+
+
+def tracking_drives(title: str, drives: dict[str, Any]) -> str:
+    """A table of drives, three rows each."""
+    names = list(next(iter(drives.values()))["online"]["figures"])
+    rows = []
+    for drive, kinds in drives.items():
+        for kind in ("single sweep", "online", "offline"):
+            moving = kinds[kind]["motion"].get("velocity_moving") or {}
+            extra = (kinds[kind]["motion"]["headings"]["within_90_deg"], moving.get("median"))
+            values = [*(kinds[kind]["figures"].get(name) for name in names), *extra]
+            rows.append((drive, kind, *("" if value is None else value for value in values)))
+    header = ["drive", "", *names, "headings within 90 degrees", "velocity error m/s, median of movers"]
+    poses = sorted({kinds["poses"] for kinds in drives.values() if "poses" in kinds})
+    return f"### {title}\n\n" + table(header, rows) + (f"\n\nPoses: {', '.join(poses)}." if poses else "")
+
+
+def tracking_real(drives: dict[str, Any]) -> str:
+    """Drives of KITTI."""
+    return tracking_drives("Real drives: Car and Van, where camera 2 sees them", drives)
+
+
+def tracking_synthetic(drives: dict[str, Any]) -> str:
+    """Ray-cast drives, and the states found on all of them together."""
+    words = [state.name.lower().replace("_", " ") for state in Motion]
+    tables = []
+    for kind in ("online", "offline"):
+        each = [kinds[kind]["motion"]["states"]["confusion"] for kinds in drives.values()]
+        total = [[sum(cells) for cells in zip(*lines, strict=True)] for lines in zip(*each, strict=True)]
+        rows = [(word, *line) for word, line in zip(words, total, strict=True)]
+        tables.append(f"States, {kind}: truth in rows, found in columns.\n\n{table(['', *words], rows)}")
+    return "\n\n".join([tracking_drives("Ray-cast drives, with exact truth", drives), *tables])
+
+
+def tracking_boxes(found: dict[str, Any]) -> str:
+    """The association alone, on the boxes of a trained detector."""
+    rows = []
+    for kind, item in found.items():
+        hota, clear = item["figures"]["hota"], item["figures"]["clear"]
+        shares = (hota["hota"], hota["det_a"], hota["ass_a"], clear["mota"])
+        rows.append((kind, *(100 * share for share in shares), clear["idsw"], clear["frag"]))
+    header = ["", "HOTA", "DetA", "AssA", "MOTA", "switches", "fragmentations"]
+    return "### Ten sequences with the boxes of a trained detector: Car, 2D\n\n" + table(header, rows)
+
+
+TRACKING_PARTS = {"real": tracking_real, "synthetic": tracking_synthetic, "boxes": tracking_boxes}
 
 
 def bad_input() -> str:
@@ -532,6 +638,11 @@ TABLES: dict[str, Callable[[], str]] = {
     "mounting": mounting,
     "status": status,
     "counts": counts,
+    "track_status": track_status,
+    "track_fields": track_fields,
+    "track_settings": track_settings,
+    "motion_states": motion_states,
+    "tracking": tracking,
     "bad_input": bad_input,
     "refused": refused,
     "same_bits": same_bits,

@@ -368,6 +368,9 @@ def view(
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")] = 8080,
     open_browser: Annotated[bool, typer.Option("--open", help="Open the browser at the page.")] = False,
+    track: Annotated[
+        bool, typer.Option("--track", help="Show tracks: ids, states, trails. The page has a switch, too.")
+    ] = False,
     preset: PresetOption = None,
     sensor: SensorOption = None,
     settings: SettingsOption = None,
@@ -396,6 +399,7 @@ def view(
             level=level,
             capacity=capacity,
             min_score=min_score,
+            track=track,
             open_browser=open_browser,
         )
         raise typer.Exit(run_view(paths, options, stdout()))

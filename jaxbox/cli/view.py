@@ -34,6 +34,8 @@ class ViewOptions:
     """Points a sweep is padded to, or None for what it needs."""
     min_score: float
     """Boxes of lower scores are hidden at first."""
+    track: bool
+    """Whether tracks are shown at first."""
     open_browser: bool
     """Whether the browser is opened at the page."""
 
@@ -59,7 +61,7 @@ def run_view(paths: Sequence[str], options: ViewOptions, console: Console) -> Ex
     )
     if options.level and mounting is not None:
         console.print(describe_mounting(mounting), markup=False)
-    wanted = initial_wish(options.config, min_score=options.min_score)
+    wanted = initial_wish(options.config, min_score=options.min_score, track=options.track)
     with open_viewer(
         sweeps, wanted=wanted, host=options.host, port=options.port, capacity=options.capacity
     ) as (viewer, url):
@@ -72,12 +74,13 @@ def run_view(paths: Sequence[str], options: ViewOptions, console: Console) -> Ex
     return ExitCode.OK
 
 
-def initial_wish(config: DetectorConfig, *, min_score: float) -> Wanted:
+def initial_wish(config: DetectorConfig, *, min_score: float, track: bool = False) -> Wanted:
     """The first sweep with some settings, by the name of their preset where they are one.
 
     Args:
       config: the settings.
       min_score: boxes of lower scores are hidden.
+      track: whether tracks are shown.
 
     Returns:
       What a page begins with.
@@ -85,7 +88,7 @@ def initial_wish(config: DetectorConfig, *, min_score: float) -> Wanted:
     >>> initial_wish(DetectorConfig.paper(), min_score=0.2).preset
     'paper'
     """
-    view = View(min_score=min_score)
+    view = View(min_score=min_score, tracks=track)
     for name, preset in DetectorConfig.presets().items():
         if preset == config:
             return Wanted(preset=name, view=view)

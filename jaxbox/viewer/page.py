@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 
 from jaxbox.viewer import words
-from jaxbox.viewer.scene import COLORINGS, Caption, Scene
+from jaxbox.viewer.scene import COLORINGS, Scene
+from jaxbox.viewer.space import Caption
 from jaxbox.viewer.thresholds import THRESHOLDS, Threshold
 from jaxbox.viewer.viewer import Viewer, Wanted
 from jaxbox.viz.colors import BACKGROUND
@@ -29,6 +30,7 @@ _SWITCHES = (
     ("hulls", "hulls of their points"),
     ("captions", "class and score"),
     ("labels", "labelled boxes"),
+    ("tracks", "tracks: ids, states, trails"),
 )
 
 _LOOKS: Mapping[str, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
@@ -236,7 +238,7 @@ class ViserPage:
                 self._nodes[name] = self._server.scene.add_line_segments(
                     f"/{name}",
                     lines[name].segments,
-                    np.array(lines[name].color, np.uint8),
+                    lines[name].end_colors,
                     thickness=LINE_PX,
                     thickness_units="screen",
                 )

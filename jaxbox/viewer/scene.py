@@ -7,7 +7,10 @@ import numpy as np
 
 from jaxbox.config import DEFAULT_SCORE_THRESHOLD
 from jaxbox.types import Detections
+from jaxbox.viewer.drives import TrackedFrame
 from jaxbox.viewer.frames import Frame
+from jaxbox.viewer.motion import motion_lines, shown_groups
+from jaxbox.viewer.space import Caption, Lines, colored_edges, edges
 from jaxbox.viz import BoxGroup, BoxSet, color_by_height, color_by_id, draw_image_boxes
 from jaxbox.viz.colors import ESTIMATE, HULL, IGNORED, TRUTH, Color, shade_by_height
 
@@ -39,28 +42,8 @@ class View:
     """Whether class and score stand above them."""
     labels: bool = True
     """Whether labelled boxes are drawn."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Caption:
-    """A short text in space."""
-
-    text: str
-    """The text."""
-    position: tuple[float, float, float]
-    """m, sensor frame."""
-    below: bool = False
-    """Whether it hangs from the position, and does not stand on it."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Lines:
-    """Lines of one colour."""
-
-    segments: np.ndarray
-    """(n, 2, 3) float32, m, sensor frame."""
-    color: Color
-    """Red, green, blue."""
+    tracks: bool = False
+    """Whether the boxes are those of tracks, by id, with their trails and velocities."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -72,57 +55,66 @@ class Scene:
     colors: np.ndarray
     """(n, 3) uint8: of the points."""
     lines: Mapping[str, Lines]
-    """By name: ``boxes``, ``hulls``, ``labels`` and ``other_labels``; some may be empty."""
+    """By name: ``boxes``, ``hulls``, ``labels`` and ``other_labels``; of tracks ``trails`` and ``arrows``
+    too; some may be empty."""
     captions: tuple[Caption, ...]
-    """Class and score of each box, and the type of each label."""
+    """Class and score of each box, or id and state of its track, and the type of each label."""
     image: np.ndarray | None
     """(h, w, 3) uint8: the camera's image with the boxes, where there is one."""
     num_boxes: int
     """Boxes drawn, or that would be were they not switched off."""
 
 
-def build_scene(frame: Frame, detections: Detections | None, view: View) -> Scene:
+def build_scene(
+    frame: Frame, detections: Detections | None, view: View, tracked: TrackedFrame | None = None
+) -> Scene:
     """Puts the arrays together.
 
     Args:
       frame: the sweep.
       detections: the answer for it; None where there is none yet.
       view: what is to be seen.
+      tracked: its tracks, which take the place of the boxes where the view wants them; None where there are
+        none.
 
     Returns:
       The scene.
     """
-    min_score = view.min_score
-    found = _no_boxes() if detections is None else BoxSet.from_detections(detections, min_score=min_score)
-    boxes = found if view.boxes else _no_boxes()
-    hulls = [] if detections is None or not view.hulls else _hull_lines(detections, found, min_score)
+    found = _no_boxes()
+    if detections is not None:
+        found = BoxSet.from_detections(detections, min_score=view.min_score)
+    groups = [BoxGroup(name="box", boxes=found, color=ESTIMATE)]
+    motion: Mapping[str, Lines] = {}
+    if view.tracks and tracked is not None:
+        groups = shown_groups(tracked, min_score=view.min_score)
+        motion = motion_lines(tracked, groups)
+    shown = groups if view.boxes else []
+    hulls = [] if detections is None or not view.hulls else _hull_lines(detections, found, view.min_score)
     vehicles, others = (
         labels if view.labels and labels is not None else _no_boxes()
         for labels in (frame.vehicles, frame.others)
     )
     lines = {
-        "boxes": Lines(segments=_edges(boxes), color=ESTIMATE),
+        "boxes": colored_edges(shown),
         "hulls": Lines(segments=_stacked(hulls), color=HULL),
-        "labels": Lines(segments=_edges(vehicles), color=TRUTH),
-        "other_labels": Lines(segments=_edges(others), color=IGNORED),
+        "labels": Lines(segments=edges(vehicles), color=TRUTH),
+        "other_labels": Lines(segments=edges(others), color=IGNORED),
+        **motion,
     }
-    captions = [*_captions(boxes), *_captions(vehicles, below=True), *_captions(others, below=True)]
+    captions = [caption for group in shown for caption in _captions(group.boxes)]
+    captions += [*_captions(vehicles, below=True), *_captions(others, below=True)]
     return Scene(
         points=frame.xyz,
         colors=COLORINGS[view.coloring](frame, detections, view),
         lines=lines,
         captions=tuple(captions if view.captions else ()),
-        image=_camera_picture(frame, boxes, vehicles, others),
-        num_boxes=len(found),
+        image=_camera_picture(frame, shown, vehicles, others),
+        num_boxes=sum(len(group.boxes) for group in groups),
     )
 
 
 def _no_boxes() -> BoxSet:
     return BoxSet(center=np.zeros((0, 3)), size=np.zeros((0, 3)), yaw=np.zeros(0))
-
-
-def _edges(boxes: BoxSet) -> np.ndarray:
-    return boxes.segments().reshape(-1, 2, 3).astype(np.float32)
 
 
 def _stacked(segments: list[np.ndarray]) -> np.ndarray:
@@ -160,11 +152,13 @@ def _captions(boxes: BoxSet, *, below: bool = False) -> list[Caption]:
     ]
 
 
-def _camera_picture(frame: Frame, boxes: BoxSet, vehicles: BoxSet, others: BoxSet) -> np.ndarray | None:
+def _camera_picture(
+    frame: Frame, shown: list[BoxGroup], vehicles: BoxSet, others: BoxSet
+) -> np.ndarray | None:
     if frame.image is None or frame.calibration is None:
         return frame.image
     groups = [
-        BoxGroup(name="box", boxes=boxes, color=ESTIMATE),
+        *shown,
         BoxGroup(name="label", boxes=dataclasses.replace(vehicles, captions=()), color=TRUTH, thickness_px=1),
         BoxGroup(name="other", boxes=dataclasses.replace(others, captions=()), color=IGNORED, thickness_px=1),
     ]

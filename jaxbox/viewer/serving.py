@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Iterator, Sequence
 
 from jaxbox import io
+from jaxbox.viewer.drives import TrackMemory, split_drives
 from jaxbox.viewer.frames import Frames
 from jaxbox.viewer.page import ViserPage
 from jaxbox.viewer.server import open_server, page_url, quiet
@@ -26,7 +27,7 @@ def open_viewer(
     """Serves a page while the block runs; in it, `Viewer.run` answers what the page's user asks for.
 
     Args:
-      sweeps: what `jaxbox.io.open_sweeps` answers.
+      sweeps: what `jaxbox.io.open_sweeps` answers; the timeline has them drive by drive.
       wanted: what the page begins with; None for the first sweep and the default preset.
       host: name or address to listen at.
       port: 0 takes a free one.
@@ -42,10 +43,12 @@ def open_viewer(
     wanted = Wanted() if wanted is None else wanted
     server = open_server(host=host, port=port)
     try:
-        page = ViserPage(server, wanted, num_sweeps=len(sweeps))
-        viewer = Viewer(Session(Frames(sweeps, capacity=capacity)), page, wanted)
-        page.connect(viewer)
-        yield viewer, page_url(server)
+        ordered, drives = split_drives(sweeps)
+        page = ViserPage(server, wanted, num_sweeps=len(ordered))
+        with contextlib.closing(TrackMemory(drives, capacity=capacity)) as tracks:
+            viewer = Viewer(Session(Frames(ordered, capacity=capacity)), page, wanted, tracks=tracks)
+            page.connect(viewer)
+            yield viewer, page_url(server)
     finally:
         with quiet():
             server.stop()

@@ -16,12 +16,15 @@ from jaxbox.config.fields import preset_config, replace_fields
 from jaxbox.io import InputError
 from jaxbox.viewer import words
 from jaxbox.viewer.config_text import config_text
+from jaxbox.viewer.drives import TrackMemory
 from jaxbox.viewer.frames import Frame
 from jaxbox.viewer.scene import Scene, View, build_scene
-from jaxbox.viewer.session import Session
+from jaxbox.viewer.session import Session, Shown
 
 SWEEPS_PER_S = 10.0
 """Rate of playing to begin with: that of most sensors."""
+TELL_S = 0.3
+"""Tracking that takes longer than this tells how far it is, s."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -76,8 +79,15 @@ class Page(Protocol):
 class Viewer:
     """A session, a page, and what is wanted of them."""
 
-    def __init__(self, session: Session, page: Page, wanted: Wanted | None = None) -> None:
-        self._session, self._page = session, page
+    def __init__(
+        self,
+        session: Session,
+        page: Page,
+        wanted: Wanted | None = None,
+        *,
+        tracks: TrackMemory | None = None,
+    ) -> None:
+        self._session, self._page, self._tracks = session, page, tracks
         self._changed = threading.Condition()
         self._wanted = Wanted() if wanted is None else wanted
         self._answered: Wanted | None = None
@@ -173,11 +183,44 @@ class Viewer:
         if not self._session.is_compiled(frame, config):
             self._show_compiling(frame, wanted)
         shown = self._session.detect(frame, config)
-        self._page.show_scene(build_scene(frame, shown.detections, wanted.view))
+        tracked, problems = None, []
+        if wanted.view.tracks and self._tracks is not None:
+            if not self._track_up_to(self._tracks, shown, wanted):
+                return
+            tracked, problems = self._tracks.find(wanted.index, config)
+        self._page.show_scene(build_scene(frame, shown.detections, wanted.view, tracked))
         min_score = wanted.view.min_score
+        answer = words.describe(shown, self._session, index=wanted.index, min_score=min_score)
         self._page.show_words(
-            words.describe(shown, self._session, index=wanted.index, min_score=min_score),
-            status=words.describe_status(shown),
+            answer + ("" if tracked is None else words.describe_tracks(tracked, min_score=min_score)),
+            status=words.describe_status(shown, tracked, problems=problems),
+            points=words.describe_points(shown),
+        )
+
+    def _track_up_to(self, tracks: TrackMemory, shown: Shown, wanted: Wanted) -> bool:
+        """Tracks what is missing up to the sweep; False where another wish came meanwhile."""
+        done, total = tracks.progress(wanted.index, shown.config)
+        # The first sweep of a drive looks for poses and compiles, and a jump takes many sweeps.
+        told_s = 0.0 if done == 0 or total - done > 1 else time.monotonic()
+        while done < total:
+            if self._is_superseded():
+                return False
+            if time.monotonic() - told_s > TELL_S:
+                self._show_tracking(done, total, shown, wanted)
+                told_s = time.monotonic()
+            tracks.step(wanted.index, shown.config)
+            done, _ = tracks.progress(wanted.index, shown.config)
+        return True
+
+    def _is_superseded(self) -> bool:
+        return self._stopped or (self._answered is not None and self._wanted is not self._answered)
+
+    def _show_tracking(self, done: int, total: int, shown: Shown, wanted: Wanted) -> None:
+        self._page.show_scene(build_scene(shown.frame, shown.detections, wanted.view))
+        text = f"tracking: {done} of {total} sweeps, once; the timeline goes back without it"
+        count = len(self._session)
+        self._page.show_words(
+            words.describe_work(text, index=wanted.index, count=count, frame=shown.frame),
             points=words.describe_points(shown),
         )
 

@@ -9,8 +9,10 @@ import cv2
 import numpy as np
 
 from jaxbox.run.summary import classes_in_words
-from jaxbox.types import Detections, Status
+from jaxbox.types import Detections, Motion, Status
+from jaxbox.viewer.drives import TrackedFrame
 from jaxbox.viewer.frames import Frame
+from jaxbox.viewer.motion import rows_of, shown_groups
 from jaxbox.viewer.session import Session, Shown
 
 _COUNTS = (
@@ -62,16 +64,48 @@ def describe(shown: Shown, session: Session, *, index: int, min_score: float) ->
     )
 
 
-def describe_status(shown: Shown) -> str:
+def describe_tracks(tracked: TrackedFrame, *, min_score: float) -> str:
+    """How many vehicles are followed, and what they do.
+
+    Args:
+      tracked: the tracks of the sweep.
+      min_score: tracks that score less are hidden.
+
+    Returns:
+      HTML.
+    """
+    rows = rows_of(tracked, shown_groups(tracked, min_score=min_score))
+    counts = np.bincount(tracked.tracks.motion[rows], minlength=len(Motion)).tolist()
+    states = [
+        f"{count} {state.name.lower().replace('_', ' ')}"
+        for state, count in zip(Motion, counts, strict=True)
+        if count
+    ]
+    noun, does = "track" if len(rows) == 1 else "tracks", ", ".join(states) or "none"
+    return _block(
+        [
+            f"<b><span data-jaxbox='tracks'>{len(rows)}</span> {noun}</b>: {does}",
+            _quiet(f"poses: {html.escape(str(tracked.pose_source))}"),
+        ],
+        name="tracking",
+    )
+
+
+def describe_status(
+    shown: Shown, tracked: TrackedFrame | None = None, *, problems: Sequence[str] = ()
+) -> str:
     """What was dropped, and what could not be read besides the points.
 
     Args:
       shown: what is on the page.
+      tracked: its tracks, where they are wanted.
+      problems: of the tracking, in words.
 
     Returns:
       HTML: a sentence each, or one that says that there is nothing.
     """
     sentences = [*Status(int(shown.detections.status)).describe(), *shown.frame.problems]
+    sentences += [*([] if tracked is None else tracked.status.describe()), *problems]
     if not sentences:
         return _block([_quiet("nothing was dropped")], name="status")
     return _block([_colored(html.escape(text), _WARNING) for text in sentences], name="status")

@@ -1,0 +1,357 @@
+"""What time gives: boxes of single sweeps, of the tracker, and of its second pass, side by side.
+
+Real drives of KITTI's tracking benchmark (Car and Van, in the bird's-eye view and 3D, where camera 2 sees
+them), ray-cast drives with exact truth, and the association alone, on boxes that a trained detector found in
+ten sequences (2D, Car, KITTI's protocol), whose one threshold is chosen on the nine others.
+
+    python -m benchmarks.bench_tracking --json tracking.json
+    python -m benchmarks.bench_tracking --parts real
+
+No constant of the tracker was chosen on the real drives but the share of a side that counts as seen (.8).
+"""
+
+import argparse
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+import jaxbox
+from benchmarks import common
+from jaxbox import DetectorConfig, Motion
+from jaxbox.evaluation.tracking import (
+    Comparison,
+    FrameBoxes,
+    FrameTruth,
+    TruthSequence,
+    compare_in_image,
+    evaluate_boxes,
+    measure_tracks,
+)
+from jaxbox.io import (
+    boxes_from_objects,
+    find_poses,
+    group_sequences,
+    objects_by_frame,
+    objects_from_tracks,
+    open_sweeps,
+    read_calibration,
+    read_track_detections,
+    read_tracks,
+)
+from jaxbox.io.sweeps import sweep_of
+from jaxbox.run.tracking import RATE_HZ, TrackedSweep, smooth_tracks
+from jaxbox.synthetic import make_sequence
+from jaxbox.synthetic.traffic import TrafficKind
+from jaxbox.tracking import Observations, Sight, TrackConfig, TrackerState, Tracks, smooth, track_sequence
+from jaxbox.tracking.poses import ego_motions
+
+PARTS = ("real", "synthetic", "boxes")
+MIN_SCORE = jaxbox.DEFAULT_SCORE_THRESHOLD
+"""Tracks of a lower score are left out of HOTA, identity and the errors; average precision takes all."""
+TYPES, IGNORED = ("Car", "Van"), ("Truck", "Misc", "Tram")
+SYNTHETIC: tuple[tuple[TrafficKind, int], ...] = (
+    ("street", 0),
+    ("street", 1),
+    ("highway", 0),
+    ("highway", 1),
+)
+MIN_TRUE_POINTS, MAX_TRUE_RANGE_M = 15, 50.0
+"""A synthetic vehicle with fewer points, or farther away, is neither found nor missed."""
+THRESHOLDS = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.85, 0.9)
+"""Thresholds of the tracks' score that are chosen from, for boxes of the trained detector."""
+TRAINED = TrackConfig(birth_score=0.6, high_score=0.5, low_score=0.1)
+"""Scores of the trained detector, through the logistic function, are those of another scale."""
+CAPACITY, MAX_TRACKS, PADDED_TO = 64, 96, 200
+"""Boxes a sweep and tracks at a time of those sequences; lengths are padded to multiples of the last."""
+
+
+def boxes_of(tracks: Tracks, chosen: Any) -> FrameBoxes:
+    """Chosen tracks of a sweep, as the evaluator takes them."""
+    return FrameBoxes(
+        boxes=np.column_stack([tracks.center, tracks.size, tracks.heading])[chosen].astype(float),
+        scores=np.asarray(tracks.score, float)[chosen],
+        ids=np.asarray(tracks.id, int)[chosen],
+        velocities=np.asarray(tracks.velocity, float)[chosen],
+        states=np.asarray(tracks.motion, int)[chosen],
+    )
+
+
+def seen_boxes(tracked: Sequence[TrackedSweep]) -> list[FrameBoxes]:
+    """The tracks that each sweep saw."""
+    return [boxes_of(tracks, seen_only(tracks).valid) for tracks in (s.tracks for s in checked(tracked))]
+
+
+def all_boxes(tracked: Sequence[TrackedSweep]) -> list[FrameBoxes]:
+    """All tracks of each sweep, those of filled gaps too."""
+    return [boxes_of(sweep.tracks, sweep.tracks.valid) for sweep in checked(tracked)]
+
+
+def checked(tracked: Iterable[TrackedSweep]) -> Iterable[Any]:
+    """The sweeps; a benchmark's all have to be read."""
+    for sweep in tracked:
+        if sweep.error is not None:
+            raise SystemExit(f"{sweep.name}: {sweep.error}")
+        yield sweep
+
+
+def row(truth: Mapping[str, TruthSequence], results: Mapping[str, list[FrameBoxes]]) -> dict[str, Any]:
+    """The figures of one kind of result."""
+    found = evaluate_boxes(truth, results, min_score=MIN_SCORE)
+    bev, volume = found["detection"]["bev_0.5"], found["detection"]["3d_0.7"]
+    figures = {
+        "BEV AP": bev["ap_r40"],
+        "BEV R90": bev["recall_at_90"],
+        "BEV recall": bev["max_recall"],
+        "3D AP": volume["ap_r40"],
+        "3D R90": volume["recall_at_90"],
+    }
+    tracks = found["tracks"]["bev"] if found["tracks"] else None
+    if tracks is not None:
+        figures |= {
+            "HOTA": tracks["hota"]["hota"],
+            "IDF1": tracks["identity"]["idf1"],
+            "switches": tracks["clear"]["idsw"],
+        }
+    return {"figures": figures, "motion": found["motion"]}
+
+
+def side_by_side(
+    name: str, truth: TruthSequence, tracked: Sequence[TrackedSweep]
+) -> dict[str, dict[str, Any]]:
+    """Single sweeps, online and offline."""
+    kinds = {
+        "single sweep": [FrameBoxes.of_detections(sweep.detections) for sweep in checked(tracked)],
+        "online": seen_boxes(tracked),
+        "offline": all_boxes(smooth_tracks(tracked)),
+    }
+    return {kind: row({name: truth}, {name: boxes}) for kind, boxes in kinds.items()}
+
+
+def measure_real(config: DetectorConfig, poses: str | None) -> dict[str, Any]:
+    """Every sequence of the tracking benchmark that there are sweeps of."""
+    root = common.data_folder("kitti_tracking") / "training"
+    found = {}
+    for name, sweeps in group_sequences(open_sweeps(root)):
+        given = find_poses(sweeps) if poses is None else poses
+        tracked = list(jaxbox.track(sweeps, config, poses=given))
+        calibration = read_calibration(root / "calib" / f"{name}.txt")
+        labels = objects_by_frame(read_tracks(root / "label_02" / f"{name}.txt"))
+        frames = [
+            FrameTruth.of_objects(labels.get(sweep.frame or 0, []), calibration, types=TYPES, ignored=IGNORED)
+            for sweep in sweeps
+        ]
+        truth = TruthSequence(frames, calibration)
+        found[name] = side_by_side(name, truth, tracked) | {"poses": str(tracked[0].pose_source)}
+    return found
+
+
+def measure_synthetic(config: DetectorConfig, num_sweeps: int) -> dict[str, Any]:
+    """Ray-cast drives, with exact velocities and states."""
+    found = {}
+    for kind, seed in SYNTHETIC:
+        sequence = make_sequence(seed, kind=kind, num_sweeps=num_sweeps)
+        name = f"{kind} {seed}"
+        poses = np.array([sweep.T_world_sensor for sweep in sequence])
+        sweeps = list(sequence)
+        tracked = list(jaxbox.track(sweeps, config, poses=poses))
+        frames = [true_frame(sweep) for sweep in sweeps]
+        found[name] = side_by_side(name, TruthSequence(frames), tracked)
+    return found
+
+
+def true_frame(sweep: Any) -> FrameTruth:
+    """The exact truth of a ray-cast sweep."""
+    truth = sweep.truth
+    near = np.linalg.norm(truth.center[:, :2], axis=1) <= MAX_TRUE_RANGE_M
+    return FrameTruth(
+        boxes=np.column_stack([truth.center, truth.size, truth.yaw]),
+        ids=truth.ids,
+        counts=near & (sweep.num_points >= MIN_TRUE_POINTS),
+        dont_care_px=np.zeros((0, 4)),
+        velocities=truth.velocity,
+        states=truth.motion,
+    )
+
+
+class TrainedSequence:
+    """A sequence of the trained detector's boxes: labels, poses and detections."""
+
+    def __init__(self, name: str) -> None:
+        root = common.data_folder("kitti_tracking_boxes") / "training"
+        self.calibration = read_calibration(root / "calib" / f"{name}.txt")
+        labels = objects_by_frame(read_tracks(root / "label_02" / f"{name}.txt"))
+        found = objects_by_frame(read_track_detections(root / "det_pointrcnn_Car" / f"{name}.txt"))
+        num = len((root / "oxts" / f"{name}.txt").read_text().splitlines())
+        # The sweeps themselves are not there, but their names say which poses are theirs.
+        sweeps = [sweep_of(root / "velodyne" / name / f"{frame:06d}.bin") for frame in range(num)]
+        poses = find_poses(sweeps)
+        if poses is None:
+            raise SystemExit(f"{root / 'oxts'}: no poses of sequence {name}.")
+        self.poses = poses
+        self.labels = [labels.get(frame, []) for frame in range(num)]
+        self.seen = [padded(found.get(frame, []), self.calibration) for frame in range(num)]
+
+    def track(self) -> list[Tracks]:
+        """The tracks of each frame, of the compiled tracker in one call."""
+        num = len(self.seen)
+        room = -num % PADDED_TO
+        seen = jax.tree.map(lambda *rows: np.stack(rows), *self.seen, *[self.seen[-1]] * room)
+        motions = np.concatenate(
+            [ego_motions(self.poses), np.tile(np.eye(4, dtype=np.float32), (room, 1, 1))]
+        )
+        dt = np.full(num + room, 1 / RATE_HZ, np.float32)
+        _, tracks = _track(TrackerState.empty(MAX_TRACKS), seen, dt, motions, TRAINED)
+        tracks = jax.tree.map(np.asarray, tracks)
+        return [jax.tree.map(lambda a, f=f: a[f], tracks) for f in range(num)]
+
+    def compare(self, tracks: Sequence[Tracks], min_score: float) -> Comparison:
+        """Tracks from a score on against the labels, in the image."""
+        found = []
+        for frame, of_sweep in enumerate(tracks):
+            shown = of_sweep.valid & of_sweep.confirmed & (of_sweep.score >= min_score)
+            boxes = boxes_of(of_sweep, shown)
+            types = ["Car"] * len(boxes.boxes)
+            found.append(
+                objects_from_tracks(
+                    boxes.boxes,
+                    boxes.scores,
+                    np.asarray(boxes.ids),
+                    self.calibration,
+                    frame=frame,
+                    types=types,
+                )
+            )
+        return compare_in_image(self.labels, found, class_name="Car")
+
+
+_track = jax.jit(track_sequence)
+
+
+def padded(objects: Sequence[Any], calibration: Any) -> Observations:
+    """Boxes of one frame, padded; nothing is known of their points."""
+    center, size, yaw = boxes_from_objects(objects, calibration, keep_heading=True)
+    num, room = len(objects), CAPACITY - len(objects)
+    score = 1 / (1 + np.exp(-np.array([item.score for item in objects])))
+
+    def pad(values: np.ndarray, *more: int) -> np.ndarray:
+        rows = np.asarray(values, np.float32).reshape(num, *more)
+        return np.concatenate([rows, np.zeros((room, *more), np.float32)])
+
+    fields: dict[str, Any] = {
+        "center": pad(center, 3),
+        "size": pad(size, 3),
+        "yaw": pad(yaw),
+        "score": pad(score),
+        "label": np.zeros(CAPACITY, np.int32),
+        "num_points": np.ones(CAPACITY, np.int32),
+        "extent": np.zeros((CAPACITY, 2), np.float32),
+        "valid": np.arange(CAPACITY) < num,
+        "first_return_m": np.full(8, 1e3, np.float32),
+    }
+    return Observations(**fields)
+
+
+def measure_boxes() -> dict[str, Any]:
+    """HOTA of the ten sequences, online and offline, each with the threshold that the nine others chose."""
+    root = common.data_folder("kitti_tracking_boxes") / "training"
+    sequences = {path.stem: TrainedSequence(path.stem) for path in sorted((root / "label_02").glob("*.txt"))}
+    online, offline = {}, {}
+    for name, sequence in sequences.items():
+        tracks = sequence.track()
+        time_s = np.arange(len(tracks)) / RATE_HZ
+        online[name] = [seen_only(of_sweep) for of_sweep in tracks]
+        offline[name] = smooth(tracks, sequence.seen, sequence.poses.T_world_sensor, time_s, TRAINED)
+    return {
+        kind: chosen_by_others(sequences, found) for kind, found in (("online", online), ("offline", offline))
+    }
+
+
+def seen_only(tracks: Tracks) -> Tracks:
+    """The tracks that this sweep saw."""
+    return dataclasses.replace(tracks, valid=tracks.valid & (tracks.sight == Sight.SEEN))
+
+
+def chosen_by_others(
+    sequences: Mapping[str, TrainedSequence], tracks: Mapping[str, Sequence[Tracks]]
+) -> dict[str, Any]:
+    """Each sequence with the threshold that is best for all others together."""
+    compared = {
+        threshold: {name: item.compare(tracks[name], threshold) for name, item in sequences.items()}
+        for threshold in THRESHOLDS
+    }
+
+    def hota(threshold: float, left_out: str) -> float:
+        others = {name: found for name, found in compared[threshold].items() if name != left_out}
+        return measure_tracks(others)["hota"]["hota"]
+
+    chosen = {name: max(THRESHOLDS, key=lambda t, n=name: hota(t, n)) for name in sequences}
+    measured = measure_tracks({name: compared[threshold][name] for name, threshold in chosen.items()})
+    return {"thresholds": chosen, "figures": measured}
+
+
+def print_rows(found: Mapping[str, Any]) -> None:
+    """The table of drives."""
+    for name, kinds in found.items():
+        rows = {kind: item["figures"] for kind, item in kinds.items() if kind != "poses"}
+        columns = list(rows["online"])
+        print()
+        common.print_table([name, *columns], [[k, *(r.get(c) for c in columns)] for k, r in rows.items()])
+        for kind in ("online", "offline"):
+            print_motion(kind, kinds[kind]["motion"])
+
+
+def print_motion(kind: str, motion: Mapping[str, Any]) -> None:
+    """Errors of velocity and heading, and the table of states, where the truth has them."""
+    headings = motion["headings"]
+    parts = [f"headings within 90 deg {_text(headings['within_90_deg'])}"]
+    for name in ("velocity_moving", "velocity_standing"):
+        if motion.get(name):
+            item = motion[name]
+            parts.append(f"{name} median {_text(item['median'])} p90 {_text(item['p90'])} m/s")
+    print(f"{kind}: " + ", ".join(parts))
+    if motion.get("states"):
+        names = [state.name.lower().replace("_", " ") for state in Motion]
+        confusion = motion["states"]["confusion"]
+        common.print_table(["truth, found", *names], [[n, *r] for n, r in zip(names, confusion, strict=True)])
+
+
+def _text(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"
+
+
+def print_boxes(found: Mapping[str, Any]) -> None:
+    """The table of the trained detector's boxes."""
+    rows = []
+    for kind, item in found.items():
+        hota, clear = item["figures"]["hota"], item["figures"]["clear"]
+        values = [hota["hota"], hota["det_a"], hota["ass_a"], clear["mota"]]
+        rows.append([kind, *(100 * value for value in values), clear["idsw"], clear["frag"]])
+    print()
+    common.print_table(["ten sequences, Car 2D", "HOTA", "DetA", "AssA", "MOTA", "switches", "frag"], rows)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = common.parser(__doc__ or "")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--poses", choices=["kiss-icp", "boxes", "none"], help="of the real drives, not oxts")
+    parser.add_argument("--sweeps", type=int, default=100, help="of each ray-cast drive")
+    options: argparse.Namespace = parser.parse_args(arguments)
+    config = common.chosen_config(options)
+    found: dict[str, Any] = {}
+    if "real" in options.parts:
+        found["real"] = measure_real(config, options.poses)
+        print_rows(found["real"])
+    if "synthetic" in options.parts:
+        found["synthetic"] = measure_synthetic(config, options.sweeps)
+        print_rows(found["synthetic"])
+    if "boxes" in options.parts:
+        found["boxes"] = measure_boxes()
+        print_boxes(found["boxes"])
+    common.write_report(found, options)
+
+
+if __name__ == "__main__":
+    main()
