@@ -47,9 +47,11 @@ def test_the_priors_of_the_configuration_are_those_of_the_labels_in_their_order(
 NAMED = re.compile(r"\bLabel\.(?:VAN|TRUCK)\b|[\"'](?:van|truck|Van|Truck)[\"']")
 OWN = {
     "evaluation/kitti.py": "the benchmark's own rule for vans",
+    "evaluation/tracking/protocol.py": "likewise",
     "io/foxglove.py": "chosen colours",
     "synthetic/scene.py": "sizes and shares of a street's vehicles",
     "synthetic/solids.py": "shapes",
+    "synthetic/traffic.py": "who plays which part in a drive",
 }
 """What some classes have to themselves; another class gets what no class in particular has."""
 

@@ -7,10 +7,10 @@ from typing import Self
 import numpy as np
 
 from jaxbox.evaluation.tracking.protocol import counts_by_limits, image_boxes
-from jaxbox.io import KittiObject, boxes_from_objects
+from jaxbox.io import VEHICLE_TYPES, KittiObject, boxes_from_objects
 from jaxbox.types import Calibration, Detections
 
-VEHICLES = ("Car", "Van", "Truck")
+VEHICLES = VEHICLE_TYPES
 IGNORED_VEHICLES = ("Misc", "Tram")
 """KITTI's types that count as a vehicle, and those that may be taken for one: trailers, trams."""
 
