@@ -631,7 +631,7 @@ def test_scores_labels_and_ages_are_those_of_the_detections():
 
 
 def test_a_low_score_keeps_a_track_alive_but_begins_none():
-    low = np.full(traffic.CAPACITY, 0.05)
+    low = np.full(traffic.CAPACITY, 0.015)
     state, _ = after_two()
     _, tracks = step(state, cars([*PLACES, [30.0, 30.0]], score=low), 0.1, STAY)
     counts = counts_of(tracks)
@@ -649,9 +649,11 @@ def test_of_two_detections_the_one_of_a_high_score_comes_first():
     assert int(tracks.detection[0]) == 1
 
 
-@pytest.mark.parametrize(("hidden", "sweeps"), [(False, 4), (True, 30)])
-def test_a_track_that_is_missed_lives_as_long_as_it_is_told(hidden, sweeps):
-    state, _ = after_two()
+@pytest.mark.parametrize(("hidden", "hits", "sweeps"), [(False, 40, 4), (True, 40, 30), (True, 7, 7)])
+def test_a_track_that_is_missed_lives_as_long_as_it_is_told_or_was_seen(hidden, hits, sweeps):
+    state = start()
+    for _ in range(hits):
+        state, _ = step(state, cars(PLACES), 0.1, STAY)
     first_return_m = np.full(traffic.NUM_AZIMUTHS, 2.0 if hidden else traffic.FAR_M)
     for _ in range(sweeps):
         state, tracks = step(state, cars([], first_return_m=first_return_m), 0.1, STAY)

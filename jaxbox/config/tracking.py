@@ -8,8 +8,9 @@ from jaxbox.config.schema import config_class
 class TrackConfig:
     """How detections of successive sweeps become tracks; see `jaxbox.tracking`."""
 
-    birth_score: Scalar = 0.1
-    """A detection that belongs to no track begins one from this score on."""
+    birth_score: Scalar = 0.02
+    """A detection that belongs to no track begins one from this score on: far below that of a vehicle, as a
+    track's score is its mean, and what a single sweep answers is not to be lost."""
     high_score: Scalar = 0.1
     """Detections from this score on are matched first (ByteTrack: two stages),"""
     low_score: Scalar = 0.01
