@@ -294,6 +294,7 @@ def row_of(tree, index):
     return jax.tree.map(lambda a: np.asarray(a[index]), tree)
 
 
+@pytest.mark.slow
 def test_vmap_over_recordings_is_each_by_itself():
     sweeps = [recording(seed).sweep(slice(None)) for seed in (0, 1)]
     together = jax.jit(jax.vmap(functools.partial(track_sequence, start())))
@@ -304,6 +305,7 @@ def test_vmap_over_recordings_is_each_by_itself():
         chex.assert_trees_all_close(one_state, row_of(state, index), rtol=1e-6, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_vmap_over_settings_is_each_by_itself():
     gates = np.array([16.0, 1.0], np.float32)
     configs = dataclasses.replace(TrackConfig(), gate=gates)
@@ -582,6 +584,7 @@ def test_a_recording_of_no_sweeps_leaves_the_state_as_it_was():
     assert tracks.id.shape == (0, NUM_SLOTS)
 
 
+@pytest.mark.slow
 def test_a_cut_recording_goes_on_bit_for_bit_from_the_saved_state():
     sweeps = recording(0)
     whole_state, whole = run(sweeps)

@@ -36,6 +36,9 @@ OTHER = dataclasses.replace(
 )
 
 
+pytestmark = pytest.mark.slow
+
+
 def known_poses(sweeps):
     """Those of a sensor that goes on along x."""
     T = np.tile(np.eye(4), (len(sweeps), 1, 1))
