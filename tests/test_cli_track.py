@@ -5,6 +5,7 @@ import csv
 import functools
 import json
 import shutil
+import types
 
 import cv2
 import numpy as np
@@ -13,8 +14,9 @@ import pytest
 from test_cli import CAPACITY, run
 from test_cli_formats import heard_ctrl_c
 
-from jaxbox import io, synthetic
+from jaxbox import Status, TrackStatus, io, synthetic
 from jaxbox.cli.config_options import chosen_track_config
+from jaxbox.cli.track_report import SequenceReport
 from jaxbox.cli.track_results import SequenceFiles, TrackFormat
 from jaxbox.evaluation.tracking.folders import evaluate_tracking_folders
 from jaxbox.io import mcap_results
@@ -373,6 +375,20 @@ def test_an_empty_recording_is_an_error(tmp_path, monkeypatch):
     result = run("track", tmp_path, "--output", tmp_path / "out")
     assert result.exit_code == 2
     assert "the recording is empty" in result.stderr
+
+
+def test_bits_of_detector_and_tracker_that_have_one_value_are_both_reported():
+    assert Status.CLUSTER_OVERFLOW == TrackStatus.POSE_FROM_BOXES
+    report = SequenceReport("drive")
+    detections = types.SimpleNamespace(status=int(Status.CLUSTER_OVERFLOW))
+    tracked = types.SimpleNamespace(
+        name="a", detections=detections, status=TrackStatus.POSE_FROM_BOXES, pose_source="boxes"
+    )
+    report.add(tracked, {"boxes": []}, min_score=0.0)
+    assert report.to_json()["status"] == {"CLUSTER_OVERFLOW": 1, "POSE_FROM_BOXES": 1}
+    overflow, source = report.warnings()
+    assert overflow.startswith("drive: 1 of 1 sweeps, a first: CLUSTER_OVERFLOW")
+    assert source.startswith("drive: 1 of 1 sweeps: POSE_FROM_BOXES")
 
 
 def test_settings_of_the_tracker_are_changed_by_name():

@@ -30,8 +30,9 @@ class SequenceReport:
     """Ids of those that moved in some sweep."""
     lane_changes: set[int] = dataclasses.field(default_factory=set)
     """Ids of those that changed lanes."""
-    bits: dict[Status | TrackStatus, tuple[int, str]] = dataclasses.field(default_factory=dict)
-    """For each status bit that occurred: in how many sweeps, and the name of the first."""
+    bits: dict[str, tuple[Status | TrackStatus, int, str]] = dataclasses.field(default_factory=dict)
+    """For each status bit that occurred, by name, as bits of the two kinds have the same values: the bit, in
+    how many sweeps, and the name of the first."""
     interrupted: bool = False
     """Whether it was ended before its last sweep."""
     has_camera: bool = True
@@ -51,8 +52,9 @@ class SequenceReport:
                 self.movers |= {box["id"]} if box["state"] != "standing" else set()
                 self.lane_changes |= {box["id"]} if box["state"] == "lane change" else set()
         for bit in (*Status(int(tracked.detections.status)), *tracked.status):
-            count, first = self.bits.get(bit, (0, tracked.name))
-            self.bits[bit] = count + 1, first
+            name = str(bit.name)
+            _, count, first = self.bits.get(name, (bit, 0, tracked.name))
+            self.bits[name] = bit, count + 1, first
 
     def to_json(self) -> dict[str, Any]:
         """What the account and scripts are told."""
@@ -64,7 +66,7 @@ class SequenceReport:
             "vehicles": len(self.vehicles),
             "moved": len(self.movers),
             "lane_changes": len(self.lane_changes),
-            "status": {str(bit.name): count for bit, (count, _) in self.bits.items()},
+            "status": {name: count for name, (_, count, _) in self.bits.items()},
         }
 
     def describe(self) -> str:
@@ -78,9 +80,10 @@ class SequenceReport:
     def warnings(self) -> list[str]:
         """A sentence for each bit: what happened, in how many sweeps, and in which first."""
         sentences = []
-        for bit, (count, first) in self.bits.items():
+        for bit, count, first in self.bits.values():
             where = f"{self.name}: {count} of {self.num_done} sweeps"
-            where += "" if bit in (*_EXPECTED,) else f", {first} first"
+            is_expected = isinstance(bit, TrackStatus) and bit in _EXPECTED
+            where += "" if is_expected else f", {first} first"
             sentences.append(f"{where}: {bit.describe()[0]}")
         return sentences
 

@@ -137,7 +137,8 @@ class _FollowedDrive:
         self.found: list[TrackedFrame | None] = []
         self.problems: list[str] = []
         self._num_sweeps, self._is_over = len(sweeps), False
-        self._trails, self._start_ns = Trails(), 0
+        self._trails = Trails()
+        self._start_ns: int | None = None
         poses = self._find_poses(sweeps)
         self._source = track(iter(sweeps), config, poses=poses, capacity=capacity)
 
@@ -173,7 +174,8 @@ class _FollowedDrive:
         """What a page shows of a sweep: some kilobytes; None for one that could not be read."""
         if tracked.tracks is None or tracked.T_world_sensor is None:
             return None
-        self._start_ns = self._start_ns or tracked.time_ns
+        if self._start_ns is None:
+            self._start_ns = tracked.time_ns
         trails: Mapping[int, np.ndarray] = {}
         is_new = TrackStatus.TIME_NOT_LATER not in tracked.status
         if is_new:
