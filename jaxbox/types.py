@@ -83,6 +83,15 @@ class Motion(enum.IntEnum):
     TURNING = 4
     LANE_CHANGE = 5
 
+    @property
+    def word(self) -> str:
+        """As results and pictures name it.
+
+        >>> Motion.LANE_CHANGE.word
+        'lane change'
+        """
+        return self.name.lower().replace("_", " ")
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)

@@ -12,14 +12,17 @@ from jaxbox.cli.console import cache_warnings, input_errors, stdout
 from jaxbox.cli.demo import run_demo
 from jaxbox.cli.detect import DetectOptions, ResultFormat, run_detect
 from jaxbox.cli.detect_ray import RayOptions, run_detect_ray
-from jaxbox.cli.eval_command import DrivesOption, evaluate
+from jaxbox.cli.eval_command import evaluate
 from jaxbox.cli.export import Platform, run_export
 from jaxbox.cli.info import print_info
 from jaxbox.cli.options import (
     EXIT_CODES,
     CapacityOption,
+    DrivesOption,
+    JsonOption,
     LevelOption,
     PresetOption,
+    QuietOption,
     SensorAtOption,
     SensorOption,
     SetOption,
@@ -189,10 +192,8 @@ def detect(
     resume: Annotated[
         bool, typer.Option("--resume", help="Pass over sweeps whose results in OUTPUT are complete.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print only what went wrong.")] = False,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object a sweep, and a summary, for scripts.")
-    ] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Detect vehicles in real sweeps: writes result files and pictures.
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.config.checks import check_config
-from jaxbox.config.fields import all_fields, base_of, parse_change, preset_config, replace_fields
+from jaxbox.config.fields import Config, all_fields, base_of, parse_change, preset_config, replace_fields
 from jaxbox.io import InputError, read_config
 from jaxbox.io.config import read_preset
 
@@ -42,10 +42,7 @@ def chosen_config(
     except ValueError as error:
         raise InputError(f"--sensor {error}") from error
     config = fitted if file is None else read_config(file, base=base, sensor=sensor)
-    try:
-        config = replace_fields(config, dict(parse_change(change) for change in changes))
-    except ValueError as error:
-        raise InputError(f"--set: {error}") from error
+    config = _changed(config, changes, "--set")
     try:
         check_config(config)
     except ValueError as error:
@@ -68,10 +65,15 @@ def chosen_track_config(changes: Sequence[str]) -> TrackConfig:
     >>> chosen_track_config(["max_misses=6"]).max_misses
     6.0
     """
+    return _changed(TrackConfig(), changes, "--track-set")
+
+
+def _changed(config: Config, changes: Sequence[str], option: str) -> Config:
+    """Settings with the changes that an option gave, each ``FIELD=VALUE``."""
     try:
-        return replace_fields(TrackConfig(), dict(parse_change(change) for change in changes))
+        return replace_fields(config, dict(parse_change(change) for change in changes))
     except ValueError as error:
-        raise InputError(f"--track-set: {error}") from error
+        raise InputError(f"{option}: {error}") from error
 
 
 def chosen_preset(preset: str | None, file: pathlib.Path | None) -> str:

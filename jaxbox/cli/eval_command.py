@@ -8,11 +8,8 @@ import typer
 from jaxbox.cli.console import input_errors, stdout
 from jaxbox.cli.evaluate import run_eval
 from jaxbox.cli.evaluate_tracking import run_eval_tracking
+from jaxbox.cli.options import DrivesOption
 from jaxbox.cli.report import SHOWN_MIN_SCORE
-
-DrivesOption = Annotated[
-    pathlib.Path | None, typer.Option(help='Text file of the drive of each frame: "frame drive" a line.')
-]
 
 
 def evaluate(

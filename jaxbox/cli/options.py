@@ -67,3 +67,10 @@ CapacityOption = Annotated[
     int | None,
     typer.Option(min=1, help="Points a sweep is padded to; by default what it needs. One compile each."),
 ]
+QuietOption = Annotated[bool, typer.Option("--quiet", help="Print only what went wrong.")]
+JsonOption = Annotated[
+    bool, typer.Option("--json", help="Print one JSON object a sweep, and a summary, for scripts.")
+]
+DrivesOption = Annotated[
+    pathlib.Path | None, typer.Option(help='Text file of the drive of each frame: "frame drive" a line.')
+]

@@ -26,17 +26,14 @@ from jaxbox.cli.track_results import SequenceFiles, TrackFormat
 from jaxbox.config import TrackConfig
 from jaxbox.config.fields import all_fields
 from jaxbox.io.results import SweepResult
-from jaxbox.run.carrier import without_points
+from jaxbox.run.carrier import ESTIMATED, without_points
 from jaxbox.run.tracking import TrackedSweep, smooth_tracks, track
 from jaxbox.tracking.poses import Poses, PoseSource
-from jaxbox.tracking.tracks import TrackStatus
 from jaxbox.tracking.trails import Trails
 from jaxbox.viz import draw_drive
 
 AUTO = "auto"
 """Poses that the data set or recording holds, else those of kiss-icp or of the boxes."""
-ESTIMATED = (PoseSource.KISS_ICP, PoseSource.BOXES, PoseSource.NONE)
-"""Words that `--poses` takes besides a file."""
 _NS_PER_S = 10**9
 
 
@@ -278,8 +275,9 @@ class _Drive:
         """What belongs to a sweep, as far as the files show it."""
         xyz, intensity = kept.take_points() if self._files.wants_points else (None, None)
         trails: Mapping[int, np.ndarray] = {}
-        is_new = TrackStatus.TIME_NOT_LATER not in tracked.status
-        if is_new and tracked.tracks is not None and tracked.T_world_sensor is not None:
+        if self._files.wants_trails:
+            assert tracked.tracks is not None
+            assert tracked.T_world_sensor is not None
             trails = self._trails.add(tracked.tracks, tracked.T_world_sensor, record["time_s"])
         return SweepResult(
             record=record,

@@ -9,8 +9,10 @@ from jaxbox.cli.config_options import chosen_config, chosen_track_config, comple
 from jaxbox.cli.console import input_errors
 from jaxbox.cli.options import (
     CapacityOption,
+    JsonOption,
     LevelOption,
     PresetOption,
+    QuietOption,
     SensorAtOption,
     SensorOption,
     SetOption,
@@ -18,8 +20,9 @@ from jaxbox.cli.options import (
     TopicOption,
 )
 from jaxbox.cli.report import SHOWN_MIN_SCORE
-from jaxbox.cli.track import AUTO, ESTIMATED, TrackOptions, run_track
+from jaxbox.cli.track import AUTO, TrackOptions, run_track
 from jaxbox.cli.track_results import TrackFormat
+from jaxbox.run.carrier import ESTIMATED
 from jaxbox.run.tracking import MAX_TRACKS, RATE_HZ
 
 TRACK_EXAMPLES = """Examples:
@@ -120,10 +123,8 @@ def track(
     resume: Annotated[
         bool, typer.Option("--resume", help="Pass over drives whose results in OUTPUT are complete.")
     ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print only what went wrong.")] = False,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON object a sweep, and a summary, for scripts.")
-    ] = False,
+    quiet: QuietOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Follow vehicles through drives: ids, velocities, headings, and what they do.
 

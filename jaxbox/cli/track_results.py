@@ -1,6 +1,7 @@
 """The files that `jaxbox track` writes of one sequence: result files, pictures and the video."""
 
 import contextlib
+import dataclasses
 import enum
 import functools
 import pathlib
@@ -14,7 +15,7 @@ from jaxbox.cli.results import written
 from jaxbox.io.jsonl import open_jsonl
 from jaxbox.io.kitti_tracking import open_track_text
 from jaxbox.io.mcap_results import open_mcap_results
-from jaxbox.io.parquet import open_track_csv, open_track_parquet
+from jaxbox.io.parquet import TRACK_COLUMNS, open_parquet, open_track_csv
 from jaxbox.io.rerun import open_rerun
 from jaxbox.io.results import SweepResult, WriteResult
 from jaxbox.viz import open_video, save_png
@@ -43,7 +44,7 @@ class _Kind(NamedTuple):
 _KINDS: Mapping[TrackFormat, _Kind] = {
     TrackFormat.KITTI: _Kind(".txt", open_track_text),
     TrackFormat.JSONL: _Kind(".jsonl", open_jsonl),
-    TrackFormat.PARQUET: _Kind(".parquet", open_track_parquet),
+    TrackFormat.PARQUET: _Kind(".parquet", functools.partial(open_parquet, columns=TRACK_COLUMNS)),
     TrackFormat.CSV: _Kind(".csv", open_track_csv),
     TrackFormat.MCAP: _Kind(".mcap", open_mcap_results, wants_points=True),
     TrackFormat.RERUN: _Kind(".rrd", open_rerun, wants_points=True),
@@ -126,7 +127,7 @@ class SequenceFiles:
             for kind, write in self._writers:
                 shown = result
                 if not (kind.wants_points and self._points):
-                    shown = _without_points(result)
+                    shown = dataclasses.replace(result, xyz=None, intensity=None)
                 write(shown)
 
     def add_picture(self, name: str, picture: np.ndarray, time_ns: int) -> None:
@@ -167,9 +168,3 @@ class SequenceFiles:
 
 _RATES_HZ = (1.0, 60.0)
 """Pictures a second that a video may have."""
-
-
-def _without_points(result: SweepResult) -> SweepResult:
-    return SweepResult(
-        record=result.record, calibration=result.calibration, image=result.image, trails=result.trails
-    )

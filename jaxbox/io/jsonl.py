@@ -92,6 +92,8 @@ def tracks_record(
     keep &= TrackStatus.TIME_NOT_LATER not in tracked.status
     rows = sorted(np.flatnonzero(keep).tolist(), key=lambda row: int(tracks.id[row]))
     num_points = np.append(np.asarray(tracked.detections.num_points), 0)
+    # Once a sweep, as the speed is computed when it is asked for.
+    listed = {name: np.asarray(getattr(tracks, name)) for name in _LISTED}
     return {
         "name": tracked.name,
         "sequence": sequence,
@@ -100,7 +102,7 @@ def tracks_record(
         "time_s": time_s,
         "T_world_sensor": tracked.T_world_sensor.tolist(),
         "pose_source": str(tracked.pose_source),
-        "boxes": [_track_box(tracks, row, int(num_points[tracks.detection[row]])) for row in rows],
+        "boxes": [_track_box(tracks, listed, row, int(num_points[tracks.detection[row]])) for row in rows],
         "status": tracked.status.describe(),
         "counts": _counts(tracks.counts),
     }
@@ -113,28 +115,19 @@ _LISTED = (
 )  # fmt: skip
 
 
-def _track_box(tracks: Tracks, row: int, num_points: int) -> dict[str, Any]:
+def _track_box(tracks: Tracks, listed: Mapping[str, np.ndarray], row: int, num_points: int) -> dict[str, Any]:
     return {
         "id": int(tracks.id[row]),
         "label": Label(int(tracks.label[row])).word,
-        "state": motion_word(int(tracks.motion[row])),
+        "state": Motion(int(tracks.motion[row])).word,
         "sight": Sight(int(tracks.sight[row])).name.lower(),
         "confirmed": bool(tracks.confirmed[row]),
         "num_points": num_points,
-        **{name: np.asarray(getattr(tracks, name))[row].tolist() for name in _LISTED},
+        **{name: values[row].tolist() for name, values in listed.items()},
         "label_probability": {
             label.word: float(tracks.label_probability[row][label.value]) for label in Label
         },
     }
-
-
-def motion_word(motion: int) -> str:
-    """A `Motion` as results name it.
-
-    >>> motion_word(5)
-    'lane change'
-    """
-    return Motion(motion).name.lower().replace("_", " ")
 
 
 def _counts(counts: Counts | TrackCounts) -> dict[str, Any]:

@@ -261,24 +261,16 @@ def objects_from_record(
 
 
 @contextlib.contextmanager
-def open_track_text(
-    path: pathlib.Path, resume: bool = False, *, coasting: bool = False
-) -> Iterator[WriteResult]:
+def open_track_text(path: pathlib.Path, *, coasting: bool = False) -> Iterator[WriteResult]:
     """Opens a tracking result file for the tracks of a drive.
 
     Args:
       path: the file, which KITTI names after the sequence: ``0000.txt``.
-      resume: must be False: a drive is written as a whole.
       coasting: as `objects_from_record`.
 
     Yields:
       What adds a sweep; one without calibration adds nothing.
-
-    Raises:
-      ValueError: for `resume`.
     """
-    if resume:
-        raise ValueError("a file of tracks is not continued.")
     objects: list[KittiObject] = []
 
     def write(result: SweepResult) -> None:

@@ -169,28 +169,15 @@ def finished_parquet(path: pathlib.Path) -> frozenset[str]:
 
 
 @contextlib.contextmanager
-def open_track_parquet(path: pathlib.Path, resume: bool = False) -> Iterator[WriteResult]:
-    """Opens a Parquet file for the tracks of a drive: `open_parquet` with `TRACK_COLUMNS`."""
-    with open_parquet(path, resume, columns=TRACK_COLUMNS) as write:
-        yield write
-
-
-@contextlib.contextmanager
-def open_track_csv(path: pathlib.Path, resume: bool = False) -> Iterator[WriteResult]:
+def open_track_csv(path: pathlib.Path) -> Iterator[WriteResult]:
     """Opens a text file with a header and commas for the tracks of a drive; its columns are `TRACK_COLUMNS`.
 
     Args:
       path: the file; its folder is made where it is missing.
-      resume: must be False: a drive is written as a whole.
 
     Yields:
       What adds a sweep.
-
-    Raises:
-      ValueError: for `resume`.
     """
-    if resume:
-        raise ValueError("a CSV file is not continued.")
     with atomic_writer(path) as handle:
         writer = csv.DictWriter(handle, list(TRACK_COLUMNS), lineterminator="\n")
         writer.writeheader()

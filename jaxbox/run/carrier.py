@@ -52,9 +52,9 @@ def make_carrier(poses: Poses | np.ndarray | PoseSource | str | None) -> Carrier
     if poses is None:
         poses = PoseSource.KISS_ICP if importlib.util.find_spec("kiss_icp") else PoseSource.BOXES
     if isinstance(poses, str):
-        if poses not in _ESTIMATED:
-            raise ValueError(f"poses is {poses!r}; give an array, or one of {', '.join(_ESTIMATED)}.")
-        return _ESTIMATED[PoseSource(poses)]()
+        if poses not in ESTIMATED:
+            raise ValueError(f"poses is {poses!r}; give an array, or one of {', '.join(ESTIMATED)}.")
+        return ESTIMATED[PoseSource(poses)]()
     return GivenPoses(poses if isinstance(poses, Poses) else Poses(poses, PoseSource.POSE_FILE))
 
 
@@ -152,11 +152,12 @@ class Standing:
         return np.eye(4)
 
 
-_ESTIMATED = {
+ESTIMATED = {
     PoseSource.KISS_ICP: RegisteredPoints,
     PoseSource.BOXES: RegisteredBoxes,
     PoseSource.NONE: Standing,
 }
+"""Sources that are no file, by the words that ask for them."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,7 +4,7 @@ import collections
 
 import numpy as np
 
-from jaxbox.tracking.tracks import Tracks
+from jaxbox.tracking.tracks import Tracks, TrackStatus
 
 TRAIL_S = 2.0
 """How long ago a trail begins, s."""
@@ -32,8 +32,11 @@ class Trails:
 
         Returns:
           For the id of each track that lives: (m, 3) float64, m, where its centre was, the oldest place first
-          and the present one last, in the sensor frame of this sweep.
+          and the present one last, in the sensor frame of this sweep. None of a sweep that was passed over,
+          whose tracks are those of the one before.
         """
+        if TrackStatus.TIME_NOT_LATER in TrackStatus(int(tracks.status)):
+            return {}
         rows = np.flatnonzero(tracks.valid)
         ids = np.asarray(tracks.id)[rows].tolist()
         center = np.asarray(tracks.center, np.float64)[rows]

@@ -176,11 +176,9 @@ class _FollowedDrive:
             return None
         if self._start_ns is None:
             self._start_ns = tracked.time_ns
-        trails: Mapping[int, np.ndarray] = {}
+        time_s = (tracked.time_ns - self._start_ns) / _NS_PER_S
+        trails = self._trails.add(tracked.tracks, tracked.T_world_sensor, time_s)
         is_new = TrackStatus.TIME_NOT_LATER not in tracked.status
-        if is_new:
-            time_s = (tracked.time_ns - self._start_ns) / _NS_PER_S
-            trails = self._trails.add(tracked.tracks, tracked.T_world_sensor, time_s)
         # A sweep that was passed over has the tracks of the one before, in the frame of that one.
         rows = np.flatnonzero(tracked.tracks.valid & is_new)
         vehicles = jax.tree.map(lambda field: field[rows] if np.ndim(field) else field, tracked.tracks)

@@ -1,7 +1,7 @@
 """What the page draws of tracks: boxes by id, where they were lately, and how fast they are."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -10,13 +10,13 @@ from jaxbox.types import Motion
 from jaxbox.viewer.drives import TrackedFrame
 from jaxbox.viewer.space import Lines
 from jaxbox.viz import BoxGroup
-from jaxbox.viz.tracks import ARROW_S, track_groups
+from jaxbox.viz.tracks import ARROW_S, shown_rows, track_groups
 
 HEAD_M, MIN_SPEED_MPS = 1.0, 0.1
 """Length of an arrow's head, and the speed below which there is no arrow."""
 
 
-def shown_groups(tracked: TrackedFrame, *, min_score: float) -> list[BoxGroup]:
+def shown_groups(tracked: TrackedFrame, *, min_score: float) -> dict[int, BoxGroup]:
     """The tracks that pictures show too, each with the colour of its id, and id and state as its caption.
 
     Args:
@@ -24,42 +24,30 @@ def shown_groups(tracked: TrackedFrame, *, min_score: float) -> list[BoxGroup]:
       min_score: tracks that score less are left out.
 
     Returns:
-      A group a track, see `jaxbox.viz.tracks.track_groups`; darker where the sweep did not see it.
+      A group a track, see `jaxbox.viz.tracks.track_groups`, by its row of `TrackedFrame.tracks`; darker where
+      the sweep did not see it.
     """
+    rows = shown_rows(tracked.tracks, min_score=min_score)
     groups = track_groups(tracked.tracks, min_score=min_score)
-    seen = (tracked.tracks.sight[rows_of(tracked, groups)] == Sight.SEEN).tolist()
-    return [
-        group if is_seen else dataclasses.replace(group, color=_darker(group))
-        for group, is_seen in zip(groups, seen, strict=True)
-    ]
+    seen = (np.asarray(tracked.tracks.sight)[rows] == Sight.SEEN).tolist()
+    return {
+        row: group if is_seen else dataclasses.replace(group, color=_darker(group))
+        for row, group, is_seen in zip(rows, groups, seen, strict=True)
+    }
 
 
-def rows_of(tracked: TrackedFrame, groups: Sequence[BoxGroup]) -> list[int]:
-    """Rows of the tracks that some groups are of.
-
-    Args:
-      tracked: of the sweep.
-      groups: as `shown_groups` gives them.
-
-    Returns:
-      A row of `TrackedFrame.tracks` a group.
-    """
-    row_of = {track_id: row for row, track_id in enumerate(tracked.tracks.id.tolist())}
-    return [row_of[int(group.name)] for group in groups]
-
-
-def motion_lines(tracked: TrackedFrame, groups: Sequence[BoxGroup]) -> dict[str, Lines]:
+def motion_lines(tracked: TrackedFrame, groups: Mapping[int, BoxGroup]) -> dict[str, Lines]:
     """Trails, and arrows that end where a vehicle will be after `ARROW_S`.
 
     Args:
       tracked: of the sweep.
-      groups: the tracks that are shown.
+      groups: the tracks that are shown, by row.
 
     Returns:
       Lines by name: ``trails`` and ``arrows``, which vehicles that stand do not have.
     """
     trails, arrows = [], []
-    for group, row in zip(groups, rows_of(tracked, groups), strict=True):
+    for row, group in groups.items():
         way = tracked.trails.get(int(group.name), np.zeros((0, 3)))
         trails.append(Lines(segments=np.stack([way[:-1], way[1:]], axis=1), color=group.color))
         if tracked.tracks.motion[row] != Motion.STANDING:

@@ -86,8 +86,8 @@ def build_scene(
     groups = [BoxGroup(name="box", boxes=found, color=ESTIMATE)]
     motion: Mapping[str, Lines] = {}
     if view.tracks and tracked is not None:
-        groups = shown_groups(tracked, min_score=view.min_score)
-        motion = motion_lines(tracked, groups)
+        by_row = shown_groups(tracked, min_score=view.min_score)
+        groups, motion = list(by_row.values()), motion_lines(tracked, by_row)
     shown = groups if view.boxes else []
     hulls = [] if detections is None or not view.hulls else _hull_lines(detections, found, view.min_score)
     vehicles, others = (

@@ -12,8 +12,8 @@ from jaxbox.run.summary import classes_in_words
 from jaxbox.types import Detections, Motion, Status
 from jaxbox.viewer.drives import TrackedFrame
 from jaxbox.viewer.frames import Frame
-from jaxbox.viewer.motion import rows_of, shown_groups
 from jaxbox.viewer.session import Session, Shown
+from jaxbox.viz.tracks import shown_rows
 
 _COUNTS = (
     ("ground_points", "ground"),
@@ -74,13 +74,9 @@ def describe_tracks(tracked: TrackedFrame, *, min_score: float) -> str:
     Returns:
       HTML.
     """
-    rows = rows_of(tracked, shown_groups(tracked, min_score=min_score))
+    rows = shown_rows(tracked.tracks, min_score=min_score)
     counts = np.bincount(tracked.tracks.motion[rows], minlength=len(Motion)).tolist()
-    states = [
-        f"{count} {state.name.lower().replace('_', ' ')}"
-        for state, count in zip(Motion, counts, strict=True)
-        if count
-    ]
+    states = [f"{count} {state.word}" for state, count in zip(Motion, counts, strict=True) if count]
     noun, does = "track" if len(rows) == 1 else "tracks", ", ".join(states) or "none"
     return _block(
         [

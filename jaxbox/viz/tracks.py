@@ -23,8 +23,8 @@ _HIDDEN_PX = 1
 """Width of the lines of tracks that were not detected in the sweep."""
 
 
-def track_groups(tracks: Tracks, *, min_score: float = 0.0, confirmed: bool = True) -> list[BoxGroup]:
-    """One group a track, with the colour of its id, and id, state and speed as its caption.
+def shown_rows(tracks: Tracks, *, min_score: float = 0.0, confirmed: bool = True) -> list[int]:
+    """Rows of the tracks that pictures show.
 
     Args:
       tracks: of one sweep, on the host.
@@ -32,20 +32,35 @@ def track_groups(tracks: Tracks, *, min_score: float = 0.0, confirmed: bool = Tr
       confirmed: whether tracks that are not confirmed are left out.
 
     Returns:
-      The groups in the order of the slots; their lines are thin where the track was not detected. Such a
-      track is left out once it was missed more often than detected: its way is a guess.
+      The rows, ascending. A track that was not detected is left out once it was missed more often than
+      detected: its way is a guess.
     """
     keep = np.asarray(tracks.valid) & (np.asarray(tracks.score) >= min_score)
     hits, age = np.asarray(tracks.hits), np.asarray(tracks.age)
     keep &= (np.asarray(tracks.sight) == Sight.SEEN.value) | (2 * hits >= age)
     keep &= np.asarray(tracks.confirmed) | (not confirmed)
-    return [_group(tracks, row) for row in np.flatnonzero(keep).tolist()]
+    return np.flatnonzero(keep).tolist()
+
+
+def track_groups(tracks: Tracks, *, min_score: float = 0.0, confirmed: bool = True) -> list[BoxGroup]:
+    """One group a track, with the colour of its id, and id, state and speed as its caption.
+
+    Args:
+      tracks: of one sweep, on the host.
+      min_score: as `shown_rows`.
+      confirmed: as `shown_rows`.
+
+    Returns:
+      The groups of `shown_rows`; their lines are thin where the track was not detected.
+    """
+    rows = shown_rows(tracks, min_score=min_score, confirmed=confirmed)
+    return [_group(tracks, row) for row in rows]
 
 
 def _group(tracks: Tracks, row: int) -> BoxGroup:
     track_id, speed = int(tracks.id[row]), float(np.hypot(*tracks.velocity[row]))
     motion = Motion(int(tracks.motion[row]))
-    words = [str(track_id), motion.name.lower().replace("_", " ")]
+    words = [str(track_id), motion.word]
     words += [f"{speed:.0f} m/s"] if motion is not Motion.STANDING else []
     sight = Sight(int(tracks.sight[row]))
     words += [f"({sight.name.lower()})"] if sight is not Sight.SEEN else []
@@ -93,12 +108,11 @@ def draw_tracks(
       (h, w, 3) uint8, red green blue.
     """
     frame = frame or BirdEyeFrame()
-    groups = track_groups(tracks, min_score=min_score, confirmed=confirmed)
+    rows = shown_rows(tracks, min_score=min_score, confirmed=confirmed)
+    groups = [_group(tracks, row) for row in rows]
     colors = shade_by_height(np.asarray(xyz)[:, 2] + SENSOR_HEIGHT_M)
     picture = draw_bird_eye(xyz, colors=colors, groups=groups, frame=frame, title=title, legend=False)
-    row_of = {int(tracks.id[row]): row for row in np.flatnonzero(tracks.valid).tolist()}
-    for group in groups:
-        row = row_of[int(group.name)]
+    for row, group in zip(rows, groups, strict=True):
         trail = (trails or {}).get(int(group.name), np.zeros((0, 3)))
         draw_polygon(picture, frame.to_pixels(trail), group.color, thickness_px=1, closed=False)
         if tracks.front_probability[row] >= MIN_FRONT_PROBABILITY:
@@ -158,6 +172,8 @@ def draw_drive(
     *,
     image: np.ndarray | None = None,
     calibration: Calibration | None = None,
+    min_score: float = 0.0,
+    confirmed: bool = True,
     **options: Any,
 ) -> np.ndarray:
     """One picture of a sweep's tracks: in the camera's image, where there is one, and from above.
@@ -167,14 +183,16 @@ def draw_drive(
       tracks: as `draw_tracks`.
       image: (h, w, 3) uint8, red green blue; None for none.
       calibration: of the camera that took it; None for none.
-      **options: of `draw_tracks`.
+      min_score: as `draw_tracks`.
+      confirmed: as `draw_tracks`.
+      **options: more of `draw_tracks`.
 
     Returns:
       (h, w, 3) uint8, red green blue.
     """
-    above = draw_tracks(xyz, tracks, **options)
+    above = draw_tracks(xyz, tracks, min_score=min_score, confirmed=confirmed, **options)
     if image is None or calibration is None:
         return above
-    shown = {name: options[name] for name in ("min_score", "confirmed") if name in options}
     scaled, camera = scale_camera(image, calibration, width_px=above.shape[1])
-    return np.concatenate([draw_image_tracks(scaled, camera, tracks, **shown), above])
+    front = draw_image_tracks(scaled, camera, tracks, min_score=min_score, confirmed=confirmed)
+    return np.concatenate([front, above])

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxbox.evaluation import matching
 from jaxbox.evaluation.tracking.judged import JudgedFrame
+from jaxbox.types import Motion
 
 MATCH_OVERLAP = 0.2
 """Bird's-eye IoU from which motion is compared: a car with its length and width swapped is among them."""
@@ -18,7 +19,7 @@ MIN_MOVING_SPEED = 1.0
 HEADING_LIMITS_DEG = (90, 10)
 """The first tells front from back, the second says how often a heading can be used."""
 
-NUM_STATES = 6
+NUM_STATES = len(Motion)
 """Standing, starting, moving, stopping, turning, and a change of lanes."""
 
 _QUANTILE = 0.9
