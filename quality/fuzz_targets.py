@@ -496,7 +496,7 @@ TARGETS: Mapping[str, Target] = {
     "ros_message": Target("a.cdr", read_message, lambda: {"ros2": serialized(2), "ros1": serialized(1)}),
     "foxglove_message": Target(
         "a.pb",
-        lambda path: check_points(*foxglove.decode_point_cloud(path.read_bytes(), "here")),
+        lambda path: check_points(*foxglove.PointCloudDecoder(path.read_bytes(), "here")()),
         lambda: {"cloud": foxglove_message().SerializeToString()},
     ),
     "argoverse2_boxes": Target(

@@ -305,15 +305,23 @@ def prepare_frames(labels: Objects, results: Objects) -> list[PreparedFrame]:
 def _build_frame(
     labels: Sequence[KittiObject], detections: Sequence[KittiObject], bev: np.ndarray, box: np.ndarray
 ) -> PreparedFrame:
-    image = image_iou(_image_boxes(labels), _image_boxes(detections))
-    regions = _image_boxes([label for label in labels if label.is_dont_care])
-    excused = image_fractions(_image_boxes(detections), regions).max(axis=1, initial=0)
+    image = image_iou(image_boxes(labels), image_boxes(detections))
+    regions = image_boxes([label for label in labels if label.is_dont_care])
+    excused = image_fractions(image_boxes(detections), regions).max(axis=1, initial=0)
     scores = np.array([item.score for item in detections], float)
     overlaps = {"image": image, "orientation": image, "bev": bev, "3d": box}
     return PreparedFrame(labels, detections, scores, overlaps, excused)
 
 
-def _image_boxes(objects: Sequence[KittiObject]) -> np.ndarray:
+def image_boxes(objects: Sequence[KittiObject]) -> np.ndarray:
+    """The 2D boxes of objects.
+
+    Args:
+      objects: n of them.
+
+    Returns:
+      (n, 4) float64, px: left, top, right, bottom.
+    """
     return np.array([item.box_px for item in objects], float).reshape(-1, 4)
 
 

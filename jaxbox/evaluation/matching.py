@@ -163,8 +163,8 @@ def _rows_of(results: Sequence[KittiObject], class_name: str, frame: str) -> np.
 
 
 def _excused(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -> np.ndarray:
-    boxes = np.array([item.box_px for item in detections], float).reshape(-1, 4)
-    regions = np.array([item.box_px for item in labels if item.is_dont_care], float).reshape(-1, 4)
+    boxes = kitti.image_boxes(detections)
+    regions = kitti.image_boxes([item for item in labels if item.is_dont_care])
     covered = image_fractions(boxes, regions).max(axis=1, initial=0)
     return (boxes[:, 3] - boxes[:, 1] < _MIN_HEIGHT_PX) | (covered > _EXCUSED_FRACTION)
 

@@ -199,32 +199,26 @@ def point_cloud(xyz: np.ndarray, intensity: np.ndarray, *, timestamp_ns: int, fr
     return cloud
 
 
-def decode_point_cloud(data: bytes, where: str) -> Points:
-    """Reads a ``foxglove.PointCloud``, in the frame that it is given in.
-
-    Args:
-      data: the protobuf message.
-      where: recording, topic and time, for the error.
-
-    Returns:
-      As `jaxbox.io.read_points`.
-
-    Raises:
-      InputError: where the message is damaged, or has no x, y, z.
-      ImportError: without the extra ``mcap``.
-    """
-    return named_points(_columns(_parsed(data, where), where), where)
-
-
 class PointCloudDecoder:
-    """A serialised ``foxglove.PointCloud``, decoded when it is called."""
+    """A serialised ``foxglove.PointCloud``, decoded when it is called, in the frame that it is given in."""
 
     def __init__(self, data: bytes, where: str) -> None:
+        """Takes a message as it is.
+
+        Args:
+          data: the protobuf message.
+          where: recording, topic and time, for the error.
+        """
         self._data, self._where = data, where
 
     def __call__(self) -> Points:
-        """Decodes the points; raises as `decode_point_cloud`."""
-        return decode_point_cloud(self._data, self._where)
+        """Decodes the points.
+
+        Raises:
+          InputError: where the message is damaged, or has no x, y, z.
+          ImportError: without the extra ``mcap``.
+        """
+        return named_points(_columns(_parsed(self._data, self._where), self._where), self._where)
 
     def timed(self) -> TimedPoints:
         """Decodes the points, and when each was measured; raises also where the times' unit is not clear."""

@@ -68,8 +68,8 @@ def read_mcap_poses(path: pathlib.Path) -> Iterator[PoseMessage]:
       InputError: where it is not such a file, or a message is damaged.
       ImportError: without the extra ``mcap``.
     """
-    files, _, _ = _index(path)
-    for file in files:
+    # The order of a folder's files is that of their messages, which a single file need not be read for.
+    for file in _index(path)[0] if path.is_dir() else [path]:
         with open_mcap_file(file) as reader:
             for schema, channel, message in reader.iter_messages(_pose_topics(reader)):
                 name = None if schema is None else POSE_TYPES.get(schema.name)

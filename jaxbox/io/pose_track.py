@@ -60,10 +60,11 @@ class PoseTrack:
         0.25
         """
         times, times_ns = self.times_ns, np.asarray(times_ns, np.int64)
-        self._check(times_ns)
+        last = np.searchsorted(times, times_ns, side="right") - 1
+        self._check(times_ns, last)
         if len(times) == 1:
             return np.tile(self.T_world_body, (len(times_ns), 1, 1))
-        low = np.clip(np.searchsorted(times, times_ns, side="right") - 1, 0, len(times) - 2)
+        low = np.clip(last, 0, len(times) - 2)
         high = low + 1
         # Beyond the ends the motion of the last tenth of a second goes on: that of two poses is mostly noise.
         far = int(MAX_EXTRAPOLATION_S * _NS_PER_S)
@@ -72,10 +73,10 @@ class PoseTrack:
         share = (times_ns - times[low]) / (times[high] - times[low])
         return interpolate_rigid(self.T_world_body[low], self.T_world_body[high], share)
 
-    def _check(self, times_ns: np.ndarray) -> None:
+    def _check(self, times_ns: np.ndarray, last: np.ndarray) -> None:
+        """Refuses times that no poses are near to; `last` is the last pose before each, -1 for none."""
         times = self.times_ns
-        low = np.searchsorted(times, times_ns, side="right") - 1
-        before, after = times[np.maximum(low, 0)], times[np.minimum(low + 1, len(times) - 1)]
+        before, after = times[np.maximum(last, 0)], times[np.minimum(last + 1, len(times) - 1)]
         outside = np.maximum(times[0] - times_ns, times_ns - times[-1])
         limit = MAX_EXTRAPOLATION_S * _NS_PER_S if len(times) > 1 else 0
         if (outside > limit).any():

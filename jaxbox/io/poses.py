@@ -13,6 +13,7 @@ from jaxbox.io.argoverse2_poses import argoverse2_poses
 from jaxbox.io.kitti_poses import camera_from_velo, odometry_pose_file, oxts_poses, sensor_poses
 from jaxbox.io.levelled import LevelSweep
 from jaxbox.io.nuscenes_poses import nuscenes_poses
+from jaxbox.io.points import RecordedPoints
 from jaxbox.io.pose_files import KITTI_COLUMNS, PoseFile, PoseFrame, read_pose_file
 from jaxbox.io.pose_track import PoseTrack, UnusableSource
 from jaxbox.io.recorded_poses import collect_poses, odometry_poses, tf_poses
@@ -102,7 +103,7 @@ def _list(sweeps: Sequence[Sweep]) -> _Listed:
     kept, headers = [], []
     for sweep in sweeps:
         if sweep.decode is not None:
-            headers.append(_header(sweep))
+            headers.append(_header(sweep.decode))
         kept.append(dataclasses.replace(sweep, decode=None))
     if len({(sweep.sequence, sweep.points_path.parent) for sweep in kept}) > 1:
         raise ValueError("the sweeps are of several sequences; see group_sequences.")
@@ -113,9 +114,9 @@ def _list(sweeps: Sequence[Sweep]) -> _Listed:
     return _Listed(tuple(kept), recorded, stamps, bool(headers), frame_id.strip("/"))
 
 
-def _header(sweep: Sweep) -> tuple[int, str]:
+def _header(points: RecordedPoints) -> tuple[int, str]:
     try:
-        return sweep.decode.header() if sweep.decode is not None else (0, "")
+        return points.header()
     except InputError:
         # A damaged message will be reported in its turn.
         return 0, ""
@@ -176,18 +177,16 @@ def _recorded(listed: _Listed, topic: str | None) -> Iterator[Poses | UnusableSo
         known = ", ".join(sorted({name for name, _ in recorded.odometry})) or "none"
         raise InputError(f"{path}: no odometry on {topic}; topics of nav_msgs/Odometry: {known}.")
     for times, by_stamp in listed.clocks:
-        clock = "" if by_stamp else ", by the times of recording"
         for item in odometry_poses(recorded, times, listed.frame_id, by_stamp=by_stamp, topic=topic):
-            yield _named(item, PoseSource.ODOMETRY, times, path, clock)
+            yield _named(item, PoseSource.ODOMETRY, times, path, by_stamp=by_stamp)
     if topic is not None:
         raise InputError(f"{path}: odometry on {topic} does not cover the sweeps, or they have no times.")
     for times, by_stamp in listed.clocks if recorded.transforms else ():
-        clock = "" if by_stamp else ", by the times of recording"
         try:
             item = tf_poses(recorded, times, listed.frame_id, by_stamp=by_stamp)
         except UnusableSource as unusable:
             item = unusable
-        yield _named(item, PoseSource.TF, times, path, clock)
+        yield _named(item, PoseSource.TF, times, path, by_stamp=by_stamp)
 
 
 def _named(
@@ -195,8 +194,10 @@ def _named(
     source: PoseSource,
     times: np.ndarray,
     path: pathlib.Path,
-    clock: str,
+    *,
+    by_stamp: bool,
 ) -> Poses | UnusableSource:
+    clock = "" if by_stamp else ", by the times of recording"
     if isinstance(found, UnusableSource):
         return UnusableSource(f"{path}, {found}{clock}")
     return Poses(found[0], source, times, f"{path}, {found[1]}{clock}")

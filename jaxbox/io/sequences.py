@@ -52,11 +52,9 @@ def _groups(sweeps: Sequence[Sweep]) -> list[_Group]:
 
 
 def _by_time(sweeps: list[Sweep]) -> list[Sweep]:
-    times = [sweep.timestamp_ns for sweep in sweeps]
-    known = [time for time in times if time is not None]
-    if len(known) < len(times):
+    if any(sweep.timestamp_ns is None for sweep in sweeps):
         return sweeps
-    return [sweep for _, sweep in sorted(zip(known, sweeps, strict=True), key=lambda pair: pair[0])]
+    return sorted(sweeps, key=lambda sweep: sweep.timestamp_ns or 0)
 
 
 def _distinct_names(places: list[tuple[pathlib.Path, str]]) -> list[str]:

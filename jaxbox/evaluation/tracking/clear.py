@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxbox.evaluation.tracking.comparison import EPSILON, Comparison, Sums, assign, ratio
+from jaxbox.evaluation.tracking.comparison import Comparison, Sums, assign_above, ratio
 
 MIN_OVERLAP = 0.5
 """Overlap from which a match counts, of CLEAR and of identity, as KITTI has it."""
@@ -100,7 +100,8 @@ def measure_clear(sequence: Comparison, *, min_overlap: float = MIN_OVERLAP) -> 
         # A frame without labels or without results leaves the tracks of the frame before as they are.
         if not overlap.size:
             continue
-        rows, columns = _match(overlap, ids == previous[true_ids][:, None], min_overlap)
+        is_kept = ids == previous[true_ids][:, None]
+        rows, columns = assign_above(overlap, min_overlap, bonus=_KEEP_TRACK * is_kept)
         found, tracks = true_ids[rows], ids[columns]
         num_switches += int(np.sum((last[found] != _NONE) & (last[found] != tracks)))
         starts[found] += previous[found] == _NONE
@@ -122,11 +123,3 @@ def measure_clear(sequence: Comparison, *, min_overlap: float = MIN_OVERLAP) -> 
         partly_tracked=sequence.num_true_ids - num_mostly - num_lost,
         mostly_lost=num_lost,
     )
-
-
-def _match(overlap: np.ndarray, kept: np.ndarray, min_overlap: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the matched pairs; kept marks those whose label had the same track before."""
-    benefit = np.where(overlap < min_overlap - EPSILON, 0, _KEEP_TRACK * kept + overlap)
-    rows, columns = assign(benefit)
-    matched = benefit[rows, columns] > EPSILON
-    return rows[matched], columns[matched]

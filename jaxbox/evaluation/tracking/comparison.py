@@ -1,6 +1,7 @@
 """One sequence as the metrics of tracking see it: identities, and the overlap of each pair in a frame."""
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -45,12 +46,12 @@ class Comparison:
         ids, num_ids = _renumbered(ids, "results")
         return cls(true_ids, ids, overlaps, num_true_ids, num_ids)
 
-    @property
+    @functools.cached_property
     def true_counts(self) -> np.ndarray:
         """(num_true_ids,) int: frames of each label's identity."""
         return np.bincount(_joined(self.true_ids), minlength=self.num_true_ids)
 
-    @property
+    @functools.cached_property
     def counts(self) -> np.ndarray:
         """(num_ids,) int: frames of each result's identity."""
         return np.bincount(_joined(self.ids), minlength=self.num_ids)
@@ -99,6 +100,25 @@ def assign(benefit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     optimize = require("scipy.optimize", extra="track", what="Metrics of tracking")
     return optimize.linear_sum_assignment(-benefit)
+
+
+def assign_above(
+    overlap: np.ndarray, min_overlap: float, *, bonus: np.ndarray | float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs rows and columns one to one, of those that overlap enough, so that the sum is greatest.
+
+    Args:
+      overlap: (A, B) in [0, 1].
+      min_overlap: from which a pair may be taken.
+      bonus: (A, B), added to the overlap of pairs that are preferred.
+
+    Returns:
+      Rows and columns of the pairs, rows ascending.
+    """
+    benefit = np.where(overlap < min_overlap - EPSILON, 0, overlap + bonus)
+    rows, columns = assign(benefit)
+    taken = benefit[rows, columns] > EPSILON
+    return rows[taken], columns[taken]
 
 
 def ratio(part: float, whole: float) -> float:

@@ -13,7 +13,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from jaxbox.evaluation.iou import image_fractions, image_iou
-from jaxbox.evaluation.tracking.comparison import EPSILON, Comparison, assign
+from jaxbox.evaluation.kitti import image_boxes
+from jaxbox.evaluation.tracking.comparison import EPSILON, Comparison, assign_above
 from jaxbox.io import KittiObject
 
 MAX_OCCLUSION, MAX_TRUNCATION = 2, 0
@@ -64,9 +65,9 @@ def compare_in_image(
     true_ids, ids, overlaps = [], [], []
     for labels_here, results_here in zip(labels, results, strict=True):
         regions = image_boxes([item for item in labels_here if item.is_dont_care])
-        here = [item for item in labels_here if _role(item, class_name) is not None]
+        roles = [(item, role) for item in labels_here if (role := _role(item, class_name)) is not None]
+        here, counts = [item for item, _ in roles], np.array([role for _, role in roles], bool)
         found = [item for item in results_here if item.type.lower() == class_name.lower() and _has_id(item)]
-        counts = np.array([_role(item, class_name) for item in here], bool)
         boxes = image_boxes(found)
         overlap = image_iou(image_boxes(here), boxes)
         kept = kept_results(overlap, counts, is_excused(boxes, regions))
@@ -93,18 +94,6 @@ def _ids(objects: Sequence[KittiObject]) -> np.ndarray:
     return np.array([item.track_id for item in objects], int)
 
 
-def image_boxes(objects: Sequence[KittiObject]) -> np.ndarray:
-    """The 2D boxes of objects.
-
-    Args:
-      objects: n of them.
-
-    Returns:
-      (n, 4) float64, px: left, top, right, bottom.
-    """
-    return np.array([item.box_px for item in objects], float).reshape(-1, 4)
-
-
 def is_excused(boxes_px: np.ndarray, regions_px: np.ndarray) -> np.ndarray:
     """Which results may be of objects that nobody labelled.
 
@@ -123,16 +112,13 @@ def is_excused(boxes_px: np.ndarray, regions_px: np.ndarray) -> np.ndarray:
     return too_low | (covered > MAX_DONT_CARE + EPSILON)
 
 
-def kept_results(
-    overlap: np.ndarray, counts: np.ndarray, excused: np.ndarray, *, min_overlap: float = REMOVAL_OVERLAP
-) -> np.ndarray:
+def kept_results(overlap: np.ndarray, counts: np.ndarray, excused: np.ndarray) -> np.ndarray:
     """Which results of a frame are right or wrong.
 
     Args:
       overlap: (A, B) in [0, 1].
       counts: (A,) bool: labels that count; the others are distractors.
       excused: (B,) bool: results that are not wrong where they match nothing.
-      min_overlap: from which a label and a result match.
 
     Returns:
       (B,) bool: not matched to a distractor, and matched or not excused.
@@ -142,8 +128,6 @@ def kept_results(
     """
     kept = ~excused
     if overlap.size:
-        benefit = np.where(overlap < min_overlap - EPSILON, 0, overlap)
-        rows, columns = assign(benefit)
-        matched = benefit[rows, columns] > EPSILON
-        kept[columns[matched]] = counts[rows[matched]]
+        rows, columns = assign_above(overlap, REMOVAL_OVERLAP)
+        kept[columns] = counts[rows]
     return kept

@@ -6,13 +6,13 @@ from typing import Self
 
 import numpy as np
 
-from jaxbox.evaluation.tracking.protocol import counts_by_limits, image_boxes
+from jaxbox.evaluation.kitti import image_boxes
+from jaxbox.evaluation.tracking.protocol import counts_by_limits
 from jaxbox.io import VEHICLE_TYPES, KittiObject, boxes_from_objects
 from jaxbox.types import Calibration, Detections
 
-VEHICLES = VEHICLE_TYPES
 IGNORED_VEHICLES = ("Misc", "Tram")
-"""KITTI's types that count as a vehicle, and those that may be taken for one: trailers, trams."""
+"""KITTI's types that may be taken for a vehicle: trailers, trams."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +54,7 @@ class FrameBoxes:
             identity -1 are left out; where one has none at all, all are single boxes.
           calibration: of the sequence.
         """
-        found = [item for item in objects if item.type.lower() in _lower(VEHICLES)]
+        found = [item for item in objects if item.type.lower() in _lower(VEHICLE_TYPES)]
         rows = [item for item in found if item.track_id is None or item.track_id >= 0]
         single = any(item.track_id is None for item in rows)
         return cls(
@@ -90,7 +90,7 @@ class FrameTruth:
         labels: Sequence[KittiObject],
         calibration: Calibration,
         *,
-        types: Iterable[str] = VEHICLES,
+        types: Iterable[str] = VEHICLE_TYPES,
         ignored: Iterable[str] = IGNORED_VEHICLES,
     ) -> Self:
         """The vehicles of one frame of tracking labels, all of one class.
