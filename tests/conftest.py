@@ -1,5 +1,6 @@
 """Shared fixtures: the real sweeps, and compiled functions that the tests share."""
 
+import gc
 import importlib
 import os
 import pathlib
@@ -39,6 +40,9 @@ SLOW = {
 }
 """Tests and fixtures that compile the whole detector, or go through many real sweeps."""
 
+MAX_MAPS = 20_000
+"""Memory maps of a process at the end of a file of tests, above which it forgets its compiled programs."""
+
 
 # The same few examples each time; `--hypothesis-profile=long` draws many new ones.
 _options = {"deadline": None, "database": None, "suppress_health_check": list(hypothesis.HealthCheck)}
@@ -70,6 +74,19 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         names = {getattr(item, "originalname", item.name), *getattr(item, "fixturenames", ())}
         if item.path.name in FAST and not names & SLOW:
             item.add_marker(pytest.mark.fast)
+
+
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """Between two files, forgets the compiled programs when they take up many memory maps.
+
+    A process may have 65,530 of them on Linux (``vm.max_map_count``), a compiled detector takes some hundred,
+    and without them the compiler ends the process with a segmentation fault.
+    """
+    if nextitem is None or nextitem.path != item.path:
+        maps = pathlib.Path("/proc/self/maps")
+        if maps.exists() and maps.read_bytes().count(b"\n") > MAX_MAPS:
+            jax.clear_caches()
+            gc.collect()
 
 
 @pytest.hookimpl(optionalhook=True)

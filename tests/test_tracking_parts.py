@@ -14,7 +14,13 @@ from jaxbox.tracking.state import empty_slots
 
 CONFIG = TrackConfig()
 STAY = np.eye(4, dtype=np.float32)
-STEP = jax.jit(track_step)
+_step = jax.jit(track_step)
+
+
+def step(state, seen, dt, T_previous_current, config=CONFIG):
+    """One compiled step, whose times and settings are of one type: all tests share its program."""
+    dt, config = jax.tree.map(np.float32, (dt, config))
+    return _step(state, seen, dt, T_previous_current, config)
 
 
 # The filter.
@@ -182,7 +188,7 @@ def test_headings_are_in_their_interval():
 
 
 def test_one_quarter_turn_is_outvoted_and_changes_neither_size_nor_extent():
-    state, step = TrackerState.empty(1), STEP
+    state = TrackerState.empty(1)
     for index in range(12):
         crossed = index == 8
         seen = traffic.observations(
@@ -199,7 +205,7 @@ def test_one_quarter_turn_is_outvoted_and_changes_neither_size_nor_extent():
 
 
 def test_boxes_whose_points_were_not_counted_have_a_yaw_all_the_same():
-    state, step = TrackerState.empty(1), STEP
+    state = TrackerState.empty(1)
     for _ in range(6):
         seen = traffic.observations(np.float32([[12.0, 7.0, 0.0]]), yaw=[0.7], num_points=[0])
         state, tracks = step(state, seen, 0.1, STAY)
@@ -211,7 +217,7 @@ def test_boxes_whose_points_were_not_counted_have_a_yaw_all_the_same():
 def test_the_turn_rate_follows_a_car_that_turns(course_weight, tolerance):
     # The course of a car that turns lags behind, and where it votes the turn rate makes up for that.
     config = TrackConfig(course_weight=course_weight)
-    rate, state, step = 0.4, TrackerState.empty(1), STEP
+    rate, state = 0.4, TrackerState.empty(1)
     for index in range(60):
         yaw = rate * 0.1 * index
         place = 20 * np.array([np.sin(yaw), 1 - np.cos(yaw)]) + [5, 5]
@@ -248,7 +254,7 @@ def states_of(name, rate_hz, seconds=13.0, fine=100):
     times = np.arange(0, seconds, 1 / fine)
     speed, course = speeds_of(name, times)
     way = np.cumsum(speed[:, None] / fine * np.stack([np.cos(course), np.sin(course)], axis=1), axis=0)
-    state, step, said = TrackerState.empty(1), STEP, []
+    state, said = TrackerState.empty(1), []
     for index in range(0, len(times), round(fine / rate_hz)):
         center = np.float32([[*(way[index] + [-40, 12]), 0]])
         seen = traffic.observations(center, yaw=course[[index]])

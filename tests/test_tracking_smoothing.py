@@ -11,7 +11,7 @@ from jaxbox.config import TrackConfig
 from jaxbox.tracking import Motion, Sight, TrackerState, offline_motion, paths, smooth, track_sequence
 
 CONFIG = TrackConfig()
-NUM_SWEEPS, MAX_TRACKS = 60, 64
+NUM_SWEEPS = 60
 track = jax.jit(track_sequence)
 
 
@@ -21,7 +21,10 @@ def rows_of(tree, index):
 
 def tracked(recording):
     """Tracks and observations of each sweep, the poses and the times."""
-    _, tracks = track(TrackerState.empty(MAX_TRACKS), *recording.sweep(slice(None)))
+    # All recordings are of one length, also that of the step's tests: they share one compiled program.
+    config = jax.tree.map(np.float32, CONFIG)
+    _, tracks = track(TrackerState.empty(24), *traffic.padded(recording).sweep(slice(None)), config)
+    assert not tracks.status.any()
     poses = [np.eye(4)]
     for moved in recording.T_previous_current[1:]:
         poses.append(poses[-1] @ moved.astype(float))

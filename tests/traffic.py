@@ -8,7 +8,7 @@ import numpy as np
 
 from jaxbox.tracking import Observations
 
-CAPACITY, NUM_AZIMUTHS = 32, 720
+CAPACITY, NUM_AZIMUTHS, NUM_SWEEPS = 32, 720, 80
 FAR_M = 200.0
 """Range of an azimuth cell without a return."""
 
@@ -31,6 +31,21 @@ class Recording:
         """What a step takes: of one sweep, or of a slice of them."""
         rows = dataclasses.replace(self.seen, **{k: v[index] for k, v in vars(self.seen).items()})
         return rows, self.dt[index], self.T_previous_current[index]
+
+
+def padded(recording: Recording, num_sweeps=NUM_SWEEPS, capacity=CAPACITY) -> Recording:
+    """The same recording, with rows without a detection, and empty sweeps of a standing sensor at its end."""
+    more = num_sweeps - len(recording)
+    rows = {}
+    for name, values in vars(recording.seen).items():
+        more_rows = 0 if name == "first_return_m" else capacity - values.shape[1]
+        rows[name] = np.pad(values, [(0, more), (0, more_rows), (0, 0)][: values.ndim])
+    moved = np.tile(np.eye(4, dtype=np.float32), (more, 1, 1))
+    return Recording(
+        Observations(**rows),
+        np.concatenate([recording.dt, np.full(more, 0.1, np.float32)]),
+        np.concatenate([recording.T_previous_current, moved]),
+    )
 
 
 def observations(center, **fields: Any) -> Observations:
@@ -79,7 +94,7 @@ def drive(start, yaw, speed, turn_rate, times, *, stops=False, lane_m=0.0):
     return np.stack([x, y, yaws, speeds], axis=1)
 
 
-def simulate(seed, num_sweeps=80, dt=0.1, num_cars=14, capacity=CAPACITY) -> Recording:
+def simulate(seed, num_sweeps=NUM_SWEEPS, dt=0.1, num_cars=14, capacity=CAPACITY) -> Recording:
     """Cars that drive, turn, stop and stand, seen from a carrier that turns, with all that goes wrong.
 
     Noise, quarter turns of boxes, misses, false alarms, and a wall that hides some of them.
