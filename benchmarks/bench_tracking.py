@@ -20,6 +20,7 @@ import numpy as np
 
 import jaxbox
 from benchmarks import common
+from benchmarks.tracking_room import count_predictions, count_seen_through
 from jaxbox import DetectorConfig, Motion
 from jaxbox.evaluation.tracking import (
     Comparison,
@@ -122,12 +123,15 @@ def side_by_side(
     name: str, truth: TruthSequence, tracked: Sequence[TrackedSweep]
 ) -> dict[str, dict[str, Any]]:
     """Single sweeps, online and offline."""
+    smoothed = smooth_tracks(tracked)
     kinds = {
         "single sweep": [FrameBoxes.of_detections(sweep.detections) for sweep in checked(tracked)],
         "online": seen_boxes(tracked),
-        "offline": all_boxes(smooth_tracks(tracked)),
+        "offline": all_boxes(smoothed),
     }
-    return {kind: row({name: truth}, {name: boxes}) for kind, boxes in kinds.items()}
+    rows: dict[str, Any] = {kind: row({name: truth}, {name: boxes}) for kind, boxes in kinds.items()}
+    predictions = count_predictions(truth.frames, tracked)
+    return rows | {"room": predictions | count_seen_through(truth.frames, tracked, smoothed)}
 
 
 def measure_real(config: DetectorConfig, poses: str | None) -> dict[str, Any]:
@@ -295,12 +299,13 @@ def chosen_by_others(
 def print_rows(found: Mapping[str, Any]) -> None:
     """The table of drives."""
     for name, kinds in found.items():
-        rows = {kind: item["figures"] for kind, item in kinds.items() if kind != "poses"}
+        rows = {kind: item["figures"] for kind, item in kinds.items() if "figures" in item}
         columns = list(rows["online"])
         print()
         common.print_table([name, *columns], [[k, *(r.get(c) for c in columns)] for k, r in rows.items()])
         for kind in ("online", "offline"):
             print_motion(kind, kinds[kind]["motion"])
+        print(", ".join(f"{name} {count}" for name, count in kinds["room"].items()))
 
 
 def print_motion(kind: str, motion: Mapping[str, Any]) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxbox
-from jaxbox import synthetic
+from jaxbox import TrackConfig, synthetic
 from jaxbox.run.carrier import Clock, GivenPoses, ReadSweep, RegisteredPoints, make_carrier
 from jaxbox.run.tracking import smooth_tracks
 from jaxbox.tracking import Poses, PoseSource
@@ -79,6 +79,16 @@ def test_the_same_drive_twice_gives_the_same_bits(drive):
     first, second = (list(jaxbox.track(drive, poses="boxes")) for _ in range(2))
     for a, b in zip(first, second, strict=True):
         for name in ("id", "center", "velocity", "score"):
+            np.testing.assert_array_equal(getattr(a.tracks, name), getattr(b.tracks, name))
+
+
+def test_a_stream_with_a_tracker_is_that_of_track(drive):
+    config = TrackConfig(confirm_hits=2.0)
+    streamed = list(jaxbox.stream(drive, track=config))
+    for a, b in zip(streamed, jaxbox.track(drive, track_config=config), strict=True):
+        assert isinstance(a, jaxbox.TrackedSweep)
+        assert (a.name, a.num_points, a.time_ns) == (b.name, b.num_points, b.time_ns)
+        for name in ("id", "center", "confirmed", "score"):
             np.testing.assert_array_equal(getattr(a.tracks, name), getattr(b.tracks, name))
 
 

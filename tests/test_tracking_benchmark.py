@@ -180,3 +180,43 @@ def test_online_is_what_each_sweep_saw_and_offline_all_of_it(bench):
     assert [boxes.ids.tolist() for boxes in bench.all_boxes(sweeps)] == [[4, 9], [4, 9]]
     with pytest.raises(SystemExit, match="000007: cut off"):
         bench.seen_boxes([sweep_of(np.zeros(2), error="cut off")])
+
+
+@pytest.fixture
+def room(bench):
+    return importlib.import_module("benchmarks.tracking_room")
+
+
+@pytest.mark.parametrize("azimuth", [0.0, 2.0, np.pi, -2.5])
+@pytest.mark.parametrize(("range_m", "share"), [(10.0, None), (20.0, 0.0), (30.0, 1.0)])
+def test_a_wall_behind_a_box_is_seen_through_it_and_one_before_hides_it(room, azimuth, range_m, share):
+    box = np.array([20 * np.cos(azimuth), 20 * np.sin(azimuth), 0.0, 4.0, 1.8, 1.5, azimuth + 0.4])
+    assert room.share_through(box, np.full(720, range_m)) == share
+
+
+def test_a_wall_behind_half_of_a_box_is_seen_through_by_half_of_the_beams(room):
+    box = np.array([20.0, 0.0, 0.0, 1.8, 4.0, 1.5, 0.0])
+    first = np.full(1440, 20.0)
+    first[720:] = 50.0
+    assert room.share_through(box, first) == pytest.approx(0.5, abs=0.03)
+
+
+def tracked_cars(seen, detected):
+    """One sweep with the cars of `truth`, some of them with a track that sees them, and some detected."""
+    boxes = cars(0)
+    fields = {"center": boxes[:, :3], "size": boxes[:, 3:6]}
+    tracks = types.SimpleNamespace(
+        valid=np.ones(NUM_CARS, bool),
+        sight=np.where(seen, Sight.SEEN, Sight.COASTING),
+        filtered_center=boxes[:, :3],
+        filtered_size=boxes[:, 3:6],
+        filtered_yaw=boxes[:, 6],
+    )
+    detections = types.SimpleNamespace(**fields, yaw=boxes[:, 6], valid=np.array(detected))
+    return types.SimpleNamespace(tracks=tracks, detections=detections)
+
+
+def test_a_prediction_counts_where_nothing_was_detected(room):
+    sweep = tracked_cars(seen=np.array([True, False, False]), detected=[True, True, False])
+    counts = room.count_predictions(truth().frames[:1], [sweep])
+    assert counts == {"vehicles": 3, "detected": 2, "only predicted": 1}

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbox._padding import aligned_empty, checked_points, fill_rows, fitting_capacity
-from jaxbox.config import DetectorConfig
+from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.config.checks import check_config
 from jaxbox.run.batching import checked_devices, detect_on
 from jaxbox.run.processes import ProcessPool, WorkerDied, ahead
@@ -56,6 +56,7 @@ def stream(
     capacity: int | None = None,
     workers: int = 1,
     devices: Sequence[Any] | None = None,
+    track: TrackConfig | None = None,
 ) -> Iterator[StreamedSweep]:
     """Finds the vehicles of recorded sweeps, and reads ahead meanwhile.
 
@@ -75,16 +76,24 @@ def stream(
       workers: processes; with 1 it is this one.
       devices: JAX devices of this process to compute on; None for all of them, and with several
         workers, each of which computes on its own first device.
+      track: the tracker's settings, to follow the vehicles of one drive too: `jaxbox.track`, which also
+        takes poses and rates, gives the results. None for each sweep by itself.
 
     Yields:
       The result of each sweep, in their order, as `detect` gives it: on a CPU, with the same bits. One that
       cannot be read comes with an error, and the others go on. One whose process dies is tried in a new
-      process, and comes with an error where that dies too.
+      process, and comes with an error where that dies too. With `track` they are `jaxbox.TrackedSweep`.
 
     Raises:
       ValueError: for settings that contradict each other, workers below 1, no devices, or devices together
         with several workers.
     """
+    if track is not None:
+        from jaxbox.run import tracking  # noqa: PLC0415 - it is built on this module
+
+        return tracking.track(
+            sweeps, config, track, key=key, capacity=capacity, workers=workers, devices=devices
+        )
     if workers < 1:
         raise ValueError(f"workers is {workers}; it must be at least 1.")
     config = DetectorConfig() if config is None else config

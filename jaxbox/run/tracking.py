@@ -12,7 +12,7 @@ import numpy as np
 from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.geometry.rigid import relative_rigid
 from jaxbox.run.carrier import Carrier, Clock, make_carrier, prepared, without_points
-from jaxbox.run.streaming import ReadableSweep, stream
+from jaxbox.run.streaming import ReadableSweep, StreamedSweep, stream
 from jaxbox.tracking.poses import Poses, PoseSource, check_pose, orthonormal_pose
 from jaxbox.tracking.smoothing import smooth
 from jaxbox.tracking.state import Observations, TrackerState, observe
@@ -31,20 +31,14 @@ _SOURCE_BITS = {
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class TrackedSweep:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TrackedSweep(StreamedSweep):
     """One sweep that went through detector and tracker, or did not."""
 
-    name: str
-    """Of the sweep."""
     sweep: ReadableSweep
     """The sweep itself, as it was given."""
-    num_points: int
-    """Points of the sweep; 0 where it could not be read."""
     time_ns: int
     """When it was taken, ns: by its own time, or since the first sweep as far as ``rate_hz`` tells."""
-    detections: Detections | None
-    """What was found, in arrays of the host; None where the sweep failed."""
     tracks: Tracks | None
     """The vehicles, in arrays of the host; None where the sweep failed."""
     T_world_sensor: np.ndarray | None
@@ -52,8 +46,6 @@ class TrackedSweep:
     where the sweep failed."""
     pose_source: PoseSource
     """Where the pose is from."""
-    error: str | None
-    """Why the sweep failed; None where it did not."""
 
     @property
     def status(self) -> TrackStatus:
@@ -130,15 +122,12 @@ def _track(
                 given = carrier.locate(index, found.detections)
                 tracks, T_world_sensor = tracker.step(found.detections, time_ns, given)
             yield TrackedSweep(
-                name=found.name,
+                **vars(found),
                 sweep=sweep,
-                num_points=found.num_points,
                 time_ns=time_ns,
-                detections=found.detections,
                 tracks=tracks,
                 T_world_sensor=T_world_sensor,
                 pose_source=carrier.source,
-                error=found.error,
             )
 
 
