@@ -51,13 +51,7 @@ def count_pictures(cells):
 
 
 @quiet_kernel
-@pytest.mark.parametrize(
-    "path",
-    [
-        pytest.param(path, marks=pytest.mark.slow if "tracking" in path.name else (), id=path.name)
-        for path in NOTEBOOKS
-    ],
-)
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=[path.name for path in NOTEBOOKS])
 def test_notebook_runs_without_data_and_leaves_nothing_behind(path, tmp_path, monkeypatch):
     monkeypatch.delenv("JAXBOX_KITTI", raising=False)
     cells = run_notebook(path, tmp_path, monkeypatch)

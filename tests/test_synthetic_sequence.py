@@ -438,7 +438,6 @@ def test_nobody_hides_behind_the_end_of_the_range():
     assert not sweep.hidden[far & (sweep.visible == 1)].any()
 
 
-@pytest.mark.slow
 def test_the_stream_reads_a_sequence():
     drive = make_sequence(3, num_sweeps=2, num_beams=32, num_azimuths=400)
     results = list(jaxbox.stream(drive))
