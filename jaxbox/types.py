@@ -13,7 +13,8 @@ Conventions, project-wide:
 import dataclasses
 import enum
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -71,6 +72,33 @@ _STATUS_TEXT = {
     "The sensor is mounted upside down, z points down, or the points are not in the sensor's frame; turn or "
     "move them first.",
 } | {bit: "; or ".join(row.overflow for row in rows) + "." for bit, rows in _OVERFLOW_ROWS.items()}
+
+
+def combine_bits(bits: Mapping[Any, jax.Array]) -> jax.Array:
+    """The status of the bits that are set.
+
+    Args:
+      bits: () bool of each.
+
+    Returns:
+      () int32.
+    """
+    return sum((jnp.where(is_set, jnp.int32(bit), 0) for bit, is_set in bits.items()), jnp.int32(0))
+
+
+def to_host(tree: Any, status: jax.Array) -> Any:
+    """A tree in NumPy arrays: on a CPU views of JAX's own memory, from an accelerator all of it at once.
+
+    Args:
+      tree: of arrays.
+      status: one of them.
+
+    Returns:
+      The same tree.
+    """
+    devices = status.devices() if isinstance(status, jax.Array) else ()
+    on_cpu = all(device.platform == "cpu" for device in devices)
+    return jax.tree.map(np.asarray, tree) if on_cpu else jax.device_get(tree)
 
 
 class Motion(enum.IntEnum):
@@ -330,9 +358,7 @@ class Detections:
         Returns:
           The detections, of one sweep or of a batch.
         """
-        devices = self.status.devices() if isinstance(self.status, jax.Array) else ()
-        on_cpu = all(device.platform == "cpu" for device in devices)
-        return jax.tree.map(np.asarray, self) if on_cpu else jax.device_get(self)
+        return to_host(self, self.status)
 
     def raise_if_failed(self) -> None:
         """Raises where anything was dropped for want of capacity, naming the field to enlarge.

@@ -228,7 +228,7 @@ class _Drive:
         path = None if asked == AUTO else asked
         try:
             found = io.find_poses(self._sweeps, poses_path=path, report=self._tell)
-        except io.InputError as error:
+        except (io.InputError, ImportError) as error:
             if path is not None:
                 raise
             # Poses of its own are a convenience: without them it goes as for a recording that has none.

@@ -1,5 +1,8 @@
 """Plane geometry that several layers share: angles, rectangles and their overlap."""
 
+import math
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
@@ -18,6 +21,18 @@ def wrap_yaw(yaw: jax.Array) -> jax.Array:
     wrapped = yaw - HALF_TURN * jnp.floor(yaw / HALF_TURN + 0.5)
     # Rounding can land on the open end.
     return jnp.where(wrapped >= HALF_TURN / 2, -HALF_TURN / 2, wrapped)
+
+
+def wrap_turn(angle: Any) -> Any:
+    """Wraps an angle to the nearest turn, [-pi, pi].
+
+    Args:
+      angle: a NumPy or JAX array of any shape, rad.
+
+    Returns:
+      The same kind and shape, rad, in [-pi, pi].
+    """
+    return angle - 2 * math.pi * (angle / (2 * math.pi)).round()
 
 
 def rotate(xy: jax.Array, yaw: jax.Array) -> jax.Array:

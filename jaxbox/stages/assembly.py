@@ -19,7 +19,16 @@ from jaxbox.stages.state import (
     Owners,
     Sweep,
 )
-from jaxbox.types import GROUND_ABOVE_M, Counts, Descriptors, Detections, Hulls, PointCloud, Status
+from jaxbox.types import (
+    GROUND_ABOVE_M,
+    Counts,
+    Descriptors,
+    Detections,
+    Hulls,
+    PointCloud,
+    Status,
+    combine_bits,
+)
 from jaxbox.xla import chunks
 from jaxbox.xla.barriers import single_kernel
 from jaxbox.xla.loops import fold_rows
@@ -192,4 +201,4 @@ def _status(cloud: PointCloud, counts: Counts, ground: Ground, config: DetectorC
         Status.NO_GROUND: ~ground.plane.found,
         Status.GROUND_ABOVE: ground.plane.found & (ground.plane.coefficients[2] > GROUND_ABOVE_M),
     } | counts.overflows(config, cloud.capacity)
-    return sum((jnp.where(is_set, jnp.int32(bit), 0) for bit, is_set in bits.items()), jnp.int32(0))
+    return combine_bits(bits)

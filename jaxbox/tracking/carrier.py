@@ -10,6 +10,7 @@ from jaxbox.config import TrackConfig
 from jaxbox.geometry.planar import rotate
 from jaxbox.tracking.state import Slots
 from jaxbox.tracking.tracks import TrackStatus
+from jaxbox.types import combine_bits
 
 RIGID_TOLERANCE = 1e-3
 """Entries of R R^T may differ from those of the identity by this."""
@@ -76,9 +77,7 @@ def check_interval(
         translation=jnp.where(usable, translation, 0.0),
         skipped=skipped,
         restarts=started & ~skipped & (is_gap | (is_rigid & is_jump)),
-        status=sum(
-            (jnp.where(started & is_set, jnp.int32(bit), 0) for bit, is_set in bits.items()), jnp.int32(0)
-        ),
+        status=jnp.where(started, combine_bits(bits), 0),
     )
 
 

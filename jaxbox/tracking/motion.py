@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.config import TrackConfig
+from jaxbox.geometry.planar import wrap_turn
 from jaxbox.tracking.state import MOMENT_S, NUM_MOMENTS, Slots
 from jaxbox.types import Motion
 
@@ -115,10 +116,6 @@ def _course(direction: jax.Array) -> jax.Array:
     return jnp.arctan2(direction[:, 1], direction[:, 0])
 
 
-def _wrap(angle: jax.Array) -> jax.Array:
-    return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
-
-
 def _compare_with_earlier(
     slots: Slots, moment_age_s: jax.Array, config: TrackConfig
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
@@ -131,7 +128,7 @@ def _compare_with_earlier(
     acceleration = (speed - earlier_speed) / age
     starting = known & (acceleration > config.starting_mps2) & (earlier_speed < STARTING_SPEED_MPS)
     stopping = known & (acceleration < -config.starting_mps2) & (speed < STOPPING_SPEED_MPS)
-    rate_deg = jnp.rad2deg(jnp.abs(_wrap(_course(slots.velocity) - _course(earlier)))) / age
+    rate_deg = jnp.rad2deg(jnp.abs(wrap_turn(_course(slots.velocity) - _course(earlier)))) / age
     turning = known & _moved_since(slots, index) & (rate_deg > config.turning_deg_per_s)
     return starting, stopping, turning & (speed > TURNING_SPEED_MPS)
 
@@ -153,7 +150,7 @@ def _lateral_shift(slots: Slots, moment_age_s: jax.Array, config: TrackConfig) -
     way = place[:, 0] - place[:, first]
     left_of_before, left_of_after = _offset(way, before), _offset(way, after)
     far = jnp.minimum(jnp.linalg.norm(before, axis=1), jnp.linalg.norm(after, axis=1)) > LANE_END_M
-    straight = jnp.abs(_wrap(_course(after) - _course(before))) < jnp.deg2rad(config.lane_course_deg)
+    straight = jnp.abs(wrap_turn(_course(after) - _course(before))) < jnp.deg2rad(config.lane_course_deg)
     # Where a curve begins or ends, the path is left of one course and right of the other.
     aside = jnp.minimum(jnp.abs(left_of_before), jnp.abs(left_of_after)) > config.lane_change_m
     aside = aside & (left_of_before * left_of_after > 0)

@@ -6,6 +6,7 @@ The states are those of `jaxbox.tracking.motion`, without its delay. Axis letter
 import numpy as np
 
 from jaxbox.config import TrackConfig
+from jaxbox.geometry.planar import wrap_turn
 from jaxbox.tracking.motion import (
     LANE_END_M,
     LANE_END_S,
@@ -48,7 +49,7 @@ def classify_paths(
     before, after = _at(speed, start), _at(speed, stop)
     acceleration = (after - before) / span_s
     course = np.arctan2(velocity[..., 1], velocity[..., 0])
-    turned = _wrap(_at(course, stop) - _at(course, start))
+    turned = wrap_turn(_at(course, stop) - _at(course, start))
     throughout = _all_between(moving, start, stop)
     rate_deg = np.rad2deg(np.abs(turned)) / span_s
     starts = long & moving & (acceleration > config.starting_mps2) & (before < STARTING_SPEED_MPS)
@@ -61,10 +62,6 @@ def classify_paths(
         Motion.STANDING,
     )
     return motion, shift
-
-
-def _wrap(angle: np.ndarray) -> np.ndarray:
-    return angle - 2 * np.pi * np.round(angle / (2 * np.pi))
 
 
 def _at(values: np.ndarray, moment: np.ndarray) -> np.ndarray:
@@ -118,7 +115,7 @@ def _lateral_shift(
     left_of_before, left_of_after = _offset(way, before), _offset(way, after)
     far = np.minimum(np.linalg.norm(before, axis=-1), np.linalg.norm(after, axis=-1)) > LANE_END_M
     first, last = (np.arctan2(d[..., 1], d[..., 0]) for d in (before, after))
-    straight = np.abs(_wrap(last - first)) < np.deg2rad(config.lane_course_deg)
+    straight = np.abs(wrap_turn(last - first)) < np.deg2rad(config.lane_course_deg)
     aside = np.minimum(np.abs(left_of_before), np.abs(left_of_after)) > config.lane_change_m
     aside &= left_of_before * left_of_after > 0
     found = whole & far & straight & aside & _all_between(moving, start, stop)

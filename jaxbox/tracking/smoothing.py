@@ -15,25 +15,29 @@ import numpy as np
 from jaxbox.config import TrackConfig
 from jaxbox.tracking.offline_motion import classify_paths
 from jaxbox.tracking.paths import Paths, gather_paths, position_variance, smooth_positions
-from jaxbox.tracking.shape import SEEN_SHARE
+from jaxbox.tracking.shape import (
+    CROSSED_WEIGHT,
+    FULL_FRONT_SPEED_MPS,
+    MAX_GROWTH,
+    MAX_SIZE_POINTS,
+    MAX_YAW_POINTS,
+    SEEN_QUANTILE,
+    SEEN_SHARE,
+)
 from jaxbox.tracking.state import Observations
 from jaxbox.tracking.tracks import Tracks
 from jaxbox.types import Motion
 
 MAX_GAP_S = 0.8
 """Longer gaps between two detections are not filled."""
-SEEN_QUANTILE, MIN_EXTENTS, MAX_GROWTH = 0.9, 5, 1.25
-"""A track is at least as long as this quantile of so many extents, but no longer than that many means."""
-MAX_SIZE_POINTS, MAX_YAW_POINTS = 500.0, 300.0
-"""More points make a detection's size, and its yaw, no surer."""
-CROSSED_WEIGHT = 1e-3
-"""Weight of the size of a detection whose length lies across the track's, and of one without points."""
+MIN_EXTENTS = 5
+"""From so many extents on, a track is at least as long as a quantile of them."""
 YAW_MEMORY_S = 0.4
 """A moving vehicle's yaw is a vote in which a detection counts exp(-t / this) at a time t from it."""
-COURSE_SPEED_MPS, COURSE_SHARE = 3.0, 0.5
-"""Above this speed the course has a vote of this share of all the others."""
-MOVING_SPEED_MPS, MOVING_DISTANCE_M = 1.0, 1.5
-"""A track moves where its median speed and its way are larger."""
+COURSE_SHARE = 0.5
+"""At speeds at which the course has a vote for the yaw, it is this share of all the others."""
+MOVING_DISTANCE_M = 1.5
+"""A track moves where its way is longer, m, and its median speed is that of one that moves."""
 TRACK_SHARE = 0.75
 """Share of the track's mean score in the logarithm of a detection's; the rest is its own."""
 
@@ -115,7 +119,9 @@ def _keep_visible_faces(
     return center + _rotate(face * (size - new_size) / 2, yaw)
 
 
-def _find_shapes(paths: Paths, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _find_shapes(
+    paths: Paths, velocity: np.ndarray, config: TrackConfig
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """What whole tracks are like.
 
     Returns:
@@ -124,7 +130,7 @@ def _find_shapes(paths: Paths, velocity: np.ndarray) -> tuple[np.ndarray, np.nda
       flat: (I, L, 2) m: length and width of the detections, along and across that yaw.
       shown: (I, L, 2) m: the same, with the track's where the sweep did not see the side.
     """
-    yaw = _vote_yaw(paths, velocity)
+    yaw = _vote_yaw(paths, velocity, config)
     crossed = np.abs(wrap_axis(paths.yaw - yaw)) > np.pi / 4
     flat = np.where(crossed[..., None], paths.size[..., 1::-1], paths.size[..., :2])
     weight = np.minimum(paths.num_points, MAX_SIZE_POINTS) * np.where(crossed, CROSSED_WEIGHT, 1.0)
@@ -145,7 +151,7 @@ def _top_extents(extents: np.ndarray) -> np.ndarray:
     return np.where((count >= MIN_EXTENTS)[:, None], top, 0.0)
 
 
-def _vote_yaw(paths: Paths, velocity: np.ndarray) -> np.ndarray:
+def _vote_yaw(paths: Paths, velocity: np.ndarray, config: TrackConfig) -> np.ndarray:
     """(I, L) rad: of all detections alike where a track stands, of those near in time where it moves."""
     weight = paths.score * np.sqrt(np.minimum(paths.num_points, MAX_YAW_POINTS)) + 1e-6
     weight = np.where(paths.hit, weight, 0.0)
@@ -153,17 +159,17 @@ def _vote_yaw(paths: Paths, velocity: np.ndarray) -> np.ndarray:
     speed = np.linalg.norm(velocity, axis=-1)
     near_vote, near_weight = _near_sum(vote, paths.step_s), _near_sum(weight, paths.step_s)
     course = np.exp(2j * np.arctan2(velocity[..., 1], velocity[..., 0]))
-    near_vote += np.where(speed > COURSE_SPEED_MPS, COURSE_SHARE * near_weight, 0.0) * course
+    near_vote += np.where(speed > config.course_speed_mps, COURSE_SHARE * near_weight, 0.0) * course
     all_votes = np.broadcast_to(vote.sum(axis=1)[:, None], vote.shape)
-    return np.angle(np.where(_is_moving(paths, speed)[:, None], near_vote, all_votes)) / 2
+    return np.angle(np.where(_is_moving(paths, speed, config)[:, None], near_vote, all_votes)) / 2
 
 
-def _is_moving(paths: Paths, speed: np.ndarray) -> np.ndarray:
+def _is_moving(paths: Paths, speed: np.ndarray, config: TrackConfig) -> np.ndarray:
     """(I,) bool: whether tracks move at all, by their median speed and their way."""
     last = paths.length[:, None, None] - 1
     way = np.take_along_axis(paths.center[..., :2], last, axis=1)[:, 0] - paths.center[:, 0, :2]
     median = np.nanmedian(np.where(paths.valid, speed, np.nan), axis=1)
-    return (median > MOVING_SPEED_MPS) & (np.linalg.norm(way, axis=1) > MOVING_DISTANCE_M)
+    return (median > config.moving_speed_mps) & (np.linalg.norm(way, axis=1) > MOVING_DISTANCE_M)
 
 
 def _near_sum(values: np.ndarray, step_s: np.ndarray) -> np.ndarray:
@@ -212,7 +218,7 @@ def _fronts(
     start = wrap_axis(heading[:, 0] - first_turn) + first_turn
     heading = heading + (start - heading[:, 0])[:, None]
     along = velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
-    votes = np.sum(np.clip(along / COURSE_SPEED_MPS, -1, 1) * moving, axis=1)
+    votes = np.sum(np.clip(along / FULL_FRONT_SPEED_MPS, -1, 1) * moving, axis=1)
     heading = heading + np.where(votes < 0, np.pi, 0.0)[:, None]
     return heading, 1 / (1 + np.exp(-np.abs(votes)))
 
@@ -224,7 +230,7 @@ def _smooth_group(
     variance = position_variance(paths, config)
     # A first pass over the centres tells speed and course, which the yaw depends on.
     _, velocity, _ = smooth_positions(paths.center[..., :2], variance, paths.step_s, config)
-    yaw, size, flat, shown = _find_shapes(paths, velocity)
+    yaw, size, flat, shown = _find_shapes(paths, velocity, config)
     whole = np.broadcast_to(size[:, None, :2], shown.shape)
     place = paths.center[..., :2]
     anchor = _keep_visible_faces(place, flat, yaw, whole, paths.sensor)

@@ -18,6 +18,7 @@ from jaxbox.tracking.carrier import Interval, check_interval, to_current_frame
 from jaxbox.tracking.state import Observations, Slots, TrackerState, empty_slots
 from jaxbox.tracking.tracks import FREE, Sight, TrackCounts, Tracks, TrackStatus
 from jaxbox.tracking.visibility import is_hidden
+from jaxbox.types import combine_bits
 from jaxbox.xla.sequences import scan_sequence
 
 Z_GAIN, FIRST_Z_GAIN = 0.3, 0.5
@@ -349,8 +350,10 @@ def _answer(
     heading, front_probability = shape.front_of(shown_yaw, slots.front_vote)
     motions, shift = motion.classify(slots, state.moment_age_s, config)
     missed = jnp.where(slots.hidden_now, Sight.HIDDEN.value, Sight.COASTING.value)
-    bits = jnp.where(counts.dropped_births > 0, jnp.int32(TrackStatus.TRACK_OVERFLOW), 0)
-    bits = bits + jnp.where(counts.invalid > 0, jnp.int32(TrackStatus.INVALID_DETECTIONS), 0)
+    bits = {
+        TrackStatus.TRACK_OVERFLOW: counts.dropped_births > 0,
+        TrackStatus.INVALID_DETECTIONS: counts.invalid > 0,
+    }
     label_sum = jnp.sum(slots.label_score, axis=1, keepdims=True)
     return Tracks(
         id=slots.id,
@@ -377,7 +380,7 @@ def _answer(
         filtered_size=size,
         filtered_yaw=yaw,
         counts=counts,
-        status=interval.status + bits,
+        status=interval.status + combine_bits(bits),
     )
 
 

@@ -8,7 +8,8 @@ import enum
 
 import jax
 import jax.numpy as jnp
-import numpy as np
+
+from jaxbox.types import to_host
 
 FREE = -1
 """`Tracks.id` of a slot without a vehicle, and `Tracks.detection` of a vehicle that was not detected."""
@@ -169,4 +170,4 @@ class Tracks:
 
     def on_host(self) -> "Tracks":
         """The same in NumPy arrays, once they are computed."""
-        return jax.tree.map(np.asarray, self)
+        return to_host(self, self.status)
