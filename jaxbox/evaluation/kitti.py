@@ -5,7 +5,9 @@ Follows the official C++ evaluator rule by rule, also where its rules surprise:
 - Labels beyond a difficulty's limits, and those of the neighbouring class, are neither found nor missed,
   and the detections matched to them neither right nor wrong. So are detections lower than the limit in
   the image; one of **any** class that is too low can still be matched to a label.
-- A DontCare region excuses the detections that it covers in the **image** metrics only: it has no box in 3D.
+- A DontCare region excuses the detections that it covers in the image, and from above where its label has a
+  size there: -1 far away in object labels, but -1000 m in those of the tracking benchmark, which **excuse
+  all that matches nothing**. In 3D it excuses nothing.
 - Scores are sampled where recall passes 0, 1/40, ... 1. Matching prefers the best score while these
   thresholds are collected, and the best overlap while precision is measured at them.
 - There is at most one threshold a label, so with fewer than 41 labels even perfect answers stay below
@@ -271,8 +273,8 @@ class PreparedFrame:
     """(m,) float64."""
     overlaps: Mapping[str, np.ndarray]
     """(n, m) of each metric."""
-    excused: np.ndarray
-    """(detections,) largest fraction in the image within one DontCare region."""
+    excused: Mapping[str, np.ndarray]
+    """(m,) of each metric: largest fraction within one DontCare region."""
 
 
 def prepare_frames(labels: Objects, results: Objects) -> list[PreparedFrame]:
@@ -299,18 +301,46 @@ def prepare_frames(labels: Objects, results: Objects) -> list[PreparedFrame]:
         if any(item.score is None for item in results[name]):
             raise ValueError(f"frame {name} has a detection without score; results need 16 columns.")
     spatial = framewise_overlaps([(camera_boxes(a), camera_boxes(b)) for a, b in pairs])
-    return [_build_frame(*pair, *overlaps) for pair, overlaps in zip(pairs, spatial, strict=True)]
+    excused = _excused_from_above(pairs)
+    return [_build_frame(*pair, *both, e) for pair, both, e in zip(pairs, spatial, excused, strict=True)]
 
 
 def _build_frame(
-    labels: Sequence[KittiObject], detections: Sequence[KittiObject], bev: np.ndarray, box: np.ndarray
+    labels: Sequence[KittiObject],
+    detections: Sequence[KittiObject],
+    bev: np.ndarray,
+    box: np.ndarray,
+    from_above: np.ndarray,
 ) -> PreparedFrame:
     image = image_iou(image_boxes(labels), image_boxes(detections))
     regions = image_boxes([label for label in labels if label.is_dont_care])
-    excused = image_fractions(image_boxes(detections), regions).max(axis=1, initial=0)
+    in_image = image_fractions(image_boxes(detections), regions).max(axis=1, initial=0)
     scores = np.array([item.score for item in detections], float)
     overlaps = {"image": image, "orientation": image, "bev": bev, "3d": box}
+    nowhere = np.zeros(len(detections))
+    excused = {"image": in_image, "orientation": in_image, "bev": from_above, "3d": nowhere}
     return PreparedFrame(labels, detections, scores, overlaps, excused)
+
+
+def _excused_from_above(pairs: Sequence[tuple[Sequence[KittiObject], Sequence[KittiObject]]]) -> list[Any]:
+    """For the labels and detections of each frame: (detections,) largest fraction within a region from above.
+
+    The official evaluator draws footprints of negative sizes too.
+    """
+    boxes = []
+    for labels, detections in pairs:
+        regions = [
+            dataclasses.replace(item, length=abs(item.length), width=abs(item.width))
+            for item in labels
+            if item.is_dont_care
+        ]
+        boxes.append((camera_boxes(detections), camera_boxes(regions)))
+    fractions = []
+    for (found, regions), (iou, _) in zip(boxes, framewise_overlaps(boxes), strict=True):
+        areas, region_areas = (part[:, 3] * part[:, 4] for part in (found, regions))
+        shared = iou / (1 + iou) * (areas[:, None] + region_areas)
+        fractions.append((shared / np.maximum(areas, 1e-9)[:, None]).max(axis=1, initial=0))
+    return fractions
 
 
 def image_boxes(objects: Sequence[KittiObject]) -> np.ndarray:
@@ -415,14 +445,13 @@ class Round:
         overlap = frame.overlaps[metric]
         used = (roles != _OTHER)[:, None] & (detection_roles != _OTHER)
         in_turns = metric == "orientation"
-        in_image = metric in ("image", "orientation")
         return cls(
             label_roles=roles,
             detection_roles=detection_roles,
             scores=frame.scores,
             overlap=overlap,
             candidate=(overlap > min_overlap) & used,
-            excused=(frame.excused > min_overlap) & in_image,
+            excused=frame.excused[metric] > min_overlap,
             similarity=_similarity(frame) if in_turns else np.broadcast_to(0.0, overlap.shape),
         )
 
