@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from kitti_objects import car
 
-from jaxbox.evaluation import kitti
+from jaxbox.evaluation import boxes, kitti
 from jaxbox.io import KittiObject, read_label_folder
 
 OFFICIAL_METRICS = {
@@ -367,8 +367,8 @@ def test_unknown_metrics_are_named():
 
 
 def test_camera_boxes_look_forward_left_up():
-    box = kitti.camera_boxes([car(right=2.0, forward=20.0)])[0]
+    box = boxes.camera_boxes([car(right=2.0, forward=20.0)])[0]
     # rotation_y 0 lies across the view, along the camera's x.
     np.testing.assert_allclose(box, [20, -2, 0.75 - 1.7, 3.9, 1.6, 1.5, -np.pi / 2])
-    assert kitti.camera_boxes([]).shape == (0, 7)
-    np.testing.assert_array_equal(kitti.camera_boxes([region(0, 0, 1, 1)])[0, 3:6], 0)
+    assert boxes.camera_boxes([]).shape == (0, 7)
+    np.testing.assert_array_equal(boxes.camera_boxes([region(0, 0, 1, 1)])[0, 3:6], 0)

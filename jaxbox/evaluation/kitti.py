@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxbox.evaluation.boxes import camera_boxes, excused_from_above, image_boxes
 from jaxbox.evaluation.iou import framewise_overlaps, image_fractions, image_iou
 from jaxbox.io import KittiObject
 
@@ -210,23 +211,6 @@ def soft_score(labels: Objects, results: Objects, *, class_name: str = "Car") ->
     return float(np.mean([curve.r40 for group in curves for curve in group if curve.difficulty != "easy"]))
 
 
-def camera_boxes(objects: Sequence[KittiObject]) -> np.ndarray:
-    """Boxes of KITTI objects in the rectified camera frame turned to x forward, y left, z up.
-
-    Args:
-      objects: n of them; DontCare regions, which have no box, get size 0.
-
-    Returns:
-      (n, 7) float64, m and rad: x, y, z of the centre, length, width, height, yaw about z.
-    """
-    rows = [(*item.location, item.length, item.width, item.height, item.rotation_y) for item in objects]
-    columns = np.array(rows, float).reshape(-1, 7)
-    right, down, forward = columns[:, :3].T
-    size = np.maximum(columns[:, 3:6], 0)
-    # The location is the centre of the bottom face, and rotation_y turns clockwise seen from above.
-    return np.column_stack([forward, -right, size[:, 2] / 2 - down, size, -columns[:, 6] - np.pi / 2])
-
-
 def label_roles(labels: Sequence[KittiObject], class_name: str, level: int) -> np.ndarray:
     """What each label is to one class and difficulty.
 
@@ -301,7 +285,7 @@ def prepare_frames(labels: Objects, results: Objects) -> list[PreparedFrame]:
         if any(item.score is None for item in results[name]):
             raise ValueError(f"frame {name} has a detection without score; results need 16 columns.")
     spatial = framewise_overlaps([(camera_boxes(a), camera_boxes(b)) for a, b in pairs])
-    excused = _excused_from_above(pairs)
+    excused = excused_from_above(pairs)
     return [_build_frame(*pair, *both, e) for pair, both, e in zip(pairs, spatial, excused, strict=True)]
 
 
@@ -320,39 +304,6 @@ def _build_frame(
     nowhere = np.zeros(len(detections))
     excused = {"image": in_image, "orientation": in_image, "bev": from_above, "3d": nowhere}
     return PreparedFrame(labels, detections, scores, overlaps, excused)
-
-
-def _excused_from_above(pairs: Sequence[tuple[Sequence[KittiObject], Sequence[KittiObject]]]) -> list[Any]:
-    """For the labels and detections of each frame: (detections,) largest fraction within a region from above.
-
-    The official evaluator draws footprints of negative sizes too.
-    """
-    boxes = []
-    for labels, detections in pairs:
-        regions = [
-            dataclasses.replace(item, length=abs(item.length), width=abs(item.width))
-            for item in labels
-            if item.is_dont_care
-        ]
-        boxes.append((camera_boxes(detections), camera_boxes(regions)))
-    fractions = []
-    for (found, regions), (iou, _) in zip(boxes, framewise_overlaps(boxes), strict=True):
-        areas, region_areas = (part[:, 3] * part[:, 4] for part in (found, regions))
-        shared = iou / (1 + iou) * (areas[:, None] + region_areas)
-        fractions.append((shared / np.maximum(areas, 1e-9)[:, None]).max(axis=1, initial=0))
-    return fractions
-
-
-def image_boxes(objects: Sequence[KittiObject]) -> np.ndarray:
-    """The 2D boxes of objects.
-
-    Args:
-      objects: n of them.
-
-    Returns:
-      (n, 4) float64, px: left, top, right, bottom.
-    """
-    return np.array([item.box_px for item in objects], float).reshape(-1, 4)
 
 
 def _curves(

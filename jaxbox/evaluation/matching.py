@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxbox.evaluation import kitti
+from jaxbox.evaluation.boxes import camera_boxes, image_boxes
 from jaxbox.evaluation.iou import framewise_overlaps, image_fractions
 from jaxbox.io import KittiObject
 from jaxbox.types import Label
@@ -111,14 +112,14 @@ def select(
         raise ValueError("labels are selected by their LiDAR points, but no sweeps were given to count them.")
     found_rows = {name: _rows_of(results[name], selection.class_name, name) for name in labels}
     found = {name: [results[name][row] for row in rows] for name, rows in found_rows.items()}
-    boxes = {name: kitti.camera_boxes(items) for name, items in found.items()}
+    boxes = {name: camera_boxes(items) for name, items in found.items()}
     scenes = []
     for name, objects in labels.items():
         roles = np.array([_label_role(item, selection) for item in objects], int)
         points = np.full(len(objects), -1) if num_points is None else np.asarray(num_points[name], int)
         roles[(roles == _COUNTS) & (points >= 0) & (points < selection.min_points)] = _IGNORED
         rows = np.flatnonzero(roles != _OTHER)
-        scenes.append((name, kitti.camera_boxes(objects)[rows], roles[rows] == _COUNTS, points[rows], rows))
+        scenes.append((name, camera_boxes(objects)[rows], roles[rows] == _COUNTS, points[rows], rows))
     overlaps = framewise_overlaps([(scene[1], boxes[scene[0]]) for scene in scenes])
     return [
         Scene(
@@ -163,8 +164,8 @@ def _rows_of(results: Sequence[KittiObject], class_name: str, frame: str) -> np.
 
 
 def _excused(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -> np.ndarray:
-    boxes = kitti.image_boxes(detections)
-    regions = kitti.image_boxes([item for item in labels if item.is_dont_care])
+    boxes = image_boxes(detections)
+    regions = image_boxes([item for item in labels if item.is_dont_care])
     covered = image_fractions(boxes, regions).max(axis=1, initial=0)
     return (boxes[:, 3] - boxes[:, 1] < _MIN_HEIGHT_PX) | (covered > _EXCUSED_FRACTION)
 

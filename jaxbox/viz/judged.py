@@ -5,8 +5,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxbox.evaluation.boxes import camera_boxes
 from jaxbox.evaluation.iou import pairwise_overlaps
-from jaxbox.evaluation.kitti import camera_boxes
 from jaxbox.evaluation.matching import RATE_OVERLAPS, Scene, cut, judge
 from jaxbox.io import KittiObject, boxes_from_objects
 from jaxbox.io.kitti import VEHICLE_TYPES

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from jaxbox.evaluation.boxes import image_boxes
 from jaxbox.evaluation.iou import image_fractions, image_iou
-from jaxbox.evaluation.kitti import image_boxes
 from jaxbox.evaluation.tracking.comparison import EPSILON, Comparison, assign_above
 from jaxbox.io import KittiObject
 

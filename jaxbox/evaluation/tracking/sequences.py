@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from jaxbox.evaluation.kitti import image_boxes
+from jaxbox.evaluation.boxes import image_boxes
 from jaxbox.evaluation.tracking.protocol import counts_by_limits
 from jaxbox.io import VEHICLE_TYPES, KittiObject, boxes_from_objects
 from jaxbox.types import Calibration, Detections
