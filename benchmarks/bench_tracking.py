@@ -313,13 +313,13 @@ def print_motion(kind: str, motion: Mapping[str, Any]) -> None:
     headings = motion["headings"]
     parts = [f"headings within 90 deg {_text(headings['within_90_deg'])}"]
     for name in ("velocity_moving", "velocity_standing"):
-        if motion.get(name):
-            item = motion[name]
+        item = motion.get(name)
+        if item and item["median"] is not None:
             parts.append(f"{name} median {_text(item['median'])} p90 {_text(item['p90'])} m/s")
     print(f"{kind}: " + ", ".join(parts))
-    if motion.get("states"):
-        names = [state.name.lower().replace("_", " ") for state in Motion]
-        confusion = motion["states"]["confusion"]
+    confusion = (motion.get("states") or {}).get("confusion")
+    if np.any(confusion):
+        names = [state.word for state in Motion]
         common.print_table(["truth, found", *names], [[n, *r] for n, r in zip(names, confusion, strict=True)])
 
 

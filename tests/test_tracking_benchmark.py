@@ -142,6 +142,7 @@ def test_the_page_shows_the_parts_that_were_recorded(bench, tmp_path, monkeypatc
         "single sweep": bench.row({"a": truth()}, {"a": found(tracked=False)}),
         "online": bench.row({"a": truth()}, {"a": found(error_mps=0.25)}),
         "offline": bench.row({"a": truth()}, {"a": found()}),
+        "room": {"vehicles": 30, "detected": 28, "only predicted": 1},
     }
     drives = {"0000": rows | {"poses": "oxts"}}
     at = {"commit": "0123456789", "processor": "one", "cpus": 1, "packages": {"jax": "1"}}
@@ -154,12 +155,15 @@ def test_the_page_shows_the_parts_that_were_recorded(bench, tmp_path, monkeypatc
         assert ("| 0000 | online | 1.000" in page) == ("real" in names)
         assert ("| street 0 | offline | 1.000" in page) == ("synthetic" in names)
         assert (f"| moving | {NUM_FRAMES * NUM_CARS} | 0 |" in page) == ("synthetic" in names)
+        assert ("| 0000 | 30 | 28 | 1 |" in page) == ("real" in names)
         assert "trained detector" not in page
         assert "01234567" in page
     monkeypatch.delitem(figures.RESULTS, "tracking")
     assert figures.tracking() == "*Not recorded yet.*"
     bench.print_rows(drives)
-    assert "velocity_moving median 0.250" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "velocity_moving median 0.250" in printed
+    assert "vehicles 30, detected 28, only predicted 1" in printed
 
 
 def sweep_of(sight, error=None):

@@ -399,7 +399,7 @@ def motion_states() -> str:
         f"{c.lane_course_deg:g} degrees, and its path ends more than {c.lane_change_m:g} m to the side of "
         "either; `lateral_shift_m` has the metres, positive to its left",
     }
-    rows = [(state.name.lower().replace("_", " "), f"`{state.name}`", text) for state, text in texts.items()]
+    rows = [(state.word, f"`{state.name}`", text) for state, text in texts.items()]
     return table(["state", "`jaxbox.Motion`", "when"], rows)
 
 
@@ -424,7 +424,13 @@ def tracking_drives(title: str, drives: dict[str, Any]) -> str:
             rows.append((drive, kind, *("" if value is None else value for value in values)))
     header = ["drive", "", *names, "headings within 90 degrees", "velocity error m/s, median of movers"]
     poses = sorted({kinds["poses"] for kinds in drives.values() if "poses" in kinds})
-    return f"### {title}\n\n" + table(header, rows) + (f"\n\nPoses: {', '.join(poses)}." if poses else "")
+    parts = [f"### {title}", table(header, rows)] + ([f"Poses: {', '.join(poses)}."] if poses else [])
+    rooms = [(drive, *kinds["room"].values()) for drive, kinds in drives.items()]
+    counts = list(next(iter(drives.values()))["room"])
+    parts.append(
+        "What the detector missed and tracks expect, and standing boxes that other sweeps saw through:"
+    )
+    return "\n\n".join([*parts, table(["drive", *counts], rooms)])
 
 
 def tracking_real(drives: dict[str, Any]) -> str:
@@ -434,7 +440,7 @@ def tracking_real(drives: dict[str, Any]) -> str:
 
 def tracking_synthetic(drives: dict[str, Any]) -> str:
     """Ray-cast drives, and the states found on all of them together."""
-    words = [state.name.lower().replace("_", " ") for state in Motion]
+    words = [state.word for state in Motion]
     tables = []
     for kind in ("online", "offline"):
         each = [kinds[kind]["motion"]["states"]["confusion"] for kinds in drives.values()]
