@@ -317,7 +317,7 @@ def print_motion(kind: str, motion: Mapping[str, Any]) -> None:
         if item and item["median"] is not None:
             parts.append(f"{name} median {_text(item['median'])} p90 {_text(item['p90'])} m/s")
     print(f"{kind}: " + ", ".join(parts))
-    confusion = (motion.get("states") or {}).get("confusion")
+    confusion = (motion.get("states") or {}).get("confusion", [])
     if np.any(confusion):
         names = [state.word for state in Motion]
         common.print_table(["truth, found", *names], [[n, *r] for n, r in zip(names, confusion, strict=True)])

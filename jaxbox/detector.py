@@ -18,6 +18,7 @@ from jaxbox.stages import (
     direction,
     evidence,
     filtering,
+    fronts,
     ground,
     hull,
     rectangles,
@@ -194,6 +195,7 @@ def assemble(
     owners = assembly.assign_points(kept, obstacles, clusters)
     hulls, area = hull.trace_owned(owners, obstacles.xy, kept, config.hull)
     num_points, shapes = descriptors.describe(owners, obstacles.xy, kept, hulls, area)
+    facing = fronts.find_fronts(owners, obstacles, kept)
     found = assembly.Found(sweep, terrain, obstacles, clusters, outlines, completed, candidates, kept)
     first_return_m = evidence.first_returns(segments.evidence, config.evidence)
-    return assembly.assemble(cloud, found, owners, hulls, num_points, shapes, first_return_m, config)
+    return assembly.assemble(cloud, found, owners, hulls, num_points, shapes, facing, first_return_m, config)

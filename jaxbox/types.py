@@ -6,7 +6,8 @@ Conventions, project-wide:
 
 - The sensor frame ("velo") is x forward, y left, z up, in metres, with the sensor at the origin.
 - ``size`` is (length, width, height) with length >= width.
-- ``yaw`` turns +x to the length axis about +z, radians, in [-pi/2, pi/2): a box has no front.
+- ``yaw`` turns +x to the length axis about +z, radians, in [-pi/2, pi/2); ``heading`` turns it to the
+  front, as far as that is known.
 - Invalid rows are masked by ``valid`` and hold finite numbers; dropped things are counted.
 """
 
@@ -321,6 +322,11 @@ class Detections:
     """(K, 3) float32, m: length >= width, height."""
     yaw: jax.Array
     """(K,) float32, rad, in [-pi/2, pi/2): length axis from +x about +z."""
+    heading: jax.Array
+    """(K,) float32, rad, in [-pi, pi]: where the front points; ``yaw`` or half a turn further."""
+    front_probability: jax.Array
+    """(K,) float32, in [.5, 1]: P(front), that the front is at ``heading`` and not opposite; .5 where the
+    points do not tell."""
     score: jax.Array
     """(K,) float32, in [0, 1]."""
     label: jax.Array

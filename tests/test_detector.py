@@ -344,6 +344,7 @@ def test_the_answer_has_the_documented_shapes_and_types():
     )
     expected = {
         "center": ((k, 3), "float32"), "size": ((k, 3), "float32"), "yaw": ((k,), "float32"),
+        "heading": ((k,), "float32"), "front_probability": ((k,), "float32"),
         "score": ((k,), "float32"), "label": ((k,), "int32"), "valid": ((k,), "bool"),
         "num_points": ((k,), "int32"), "hulls.vertices": ((k, h, 2), "float32"),
         "hulls.num_vertices": ((k,), "int32"), "descriptors.moment_of_inertia": ((k, 2), "float32"),

@@ -21,7 +21,8 @@ LINE = "Car 0.00 0 1.85 387.63 181.54 423.81 203.12 1.67 1.87 3.69 -16.53 2.39 5
 def make_detections(center, size, yaw, score, label, valid=None) -> Detections:
     """Boxes, with the rest of a sweep's answer empty."""
     count = len(center)
-    rows = {"center": center, "size": size, "yaw": yaw, "score": score}
+    rows = {"center": center, "size": size, "yaw": yaw, "heading": yaw, "score": score}
+    rows["front_probability"] = np.full(count, 0.5)
     arrays = {name: np.asarray(array, np.float32) for name, array in rows.items()}
     empty = {
         kind: kind(**{field.name: np.zeros(count) for field in dataclasses.fields(kind)})

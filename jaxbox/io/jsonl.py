@@ -31,8 +31,8 @@ def detections_record(
     Returns:
       ``name``; ``timestamp_ns``, or None; ``boxes``, best first, each with ``label`` (a
       `Label.word`, such as "car"), ``score``, ``center`` (3, m), ``size`` (3, m: length, width, height),
-      ``yaw`` (rad) and ``num_points``; ``status``, one sentence a bit, empty for a clean run; ``counts``, as
-      `Counts`.
+      ``yaw`` (rad), ``heading`` (rad, to the front), ``front_probability`` and ``num_points``; ``status``,
+      one sentence a bit, empty for a clean run; ``counts``, as `Counts`.
     """
     keep = np.asarray(detections.valid) & (np.asarray(detections.score) >= min_score)
     return {
@@ -51,6 +51,8 @@ def _box(detections: Detections, row: int) -> dict[str, Any]:
         "center": np.asarray(detections.center[row]).tolist(),
         "size": np.asarray(detections.size[row]).tolist(),
         "yaw": float(detections.yaw[row]),
+        "heading": float(detections.heading[row]),
+        "front_probability": float(detections.front_probability[row]),
         "num_points": int(detections.num_points[row]),
     }
 

@@ -251,8 +251,8 @@ def objects_from_detections(
 ) -> list[KittiObject]:
     """Turns one sweep's boxes into KITTI results: those that the camera sees.
 
-    Truncation and occlusion are -1, as results do not hold them. A box has no front, so `rotation_y` is
-    right up to half a turn.
+    Truncation and occlusion are -1, as results do not hold them. `rotation_y` is that of the heading; where
+    ``front_probability`` is .5 it may be half a turn off.
 
     Args:
       detections: of one sweep, not a batch.
@@ -268,7 +268,7 @@ def objects_from_detections(
     objects = objects_from_boxes(
         np.asarray(detections.center),
         np.asarray(detections.size),
-        np.asarray(detections.yaw),
+        np.asarray(detections.heading),
         calibration,
         types=[Label(label).word.capitalize() for label in np.asarray(detections.label).tolist()],
         min_visible_fraction=min_visible_fraction,

@@ -2,9 +2,9 @@
 
 Columns: ``sweep`` (its name), ``timestamp_ns`` (int64, ns since 1970, or null), ``label`` (a
 `Label.word`, such as "car"), ``score``, ``center_x``, ``center_y``, ``center_z``, ``length``, ``width``,
-``height`` (m, sensor frame), ``yaw`` (rad), all float32, and ``num_points`` (int32). A sweep without boxes
-has no row; the names of all sweeps are a JSON list in the file's metadata under ``jaxbox.sweeps``.
-Tracks have more columns, `TRACK_COLUMNS`, also in text with commas.
+``height`` (m, sensor frame), ``yaw`` and ``heading`` (rad), ``front_probability``, all float32, and
+``num_points`` (int32). A sweep without boxes has no row; the names of all sweeps are a JSON list in the
+file's metadata under ``jaxbox.sweeps``. Tracks have more columns, `TRACK_COLUMNS`, also in text with commas.
 """
 
 import contextlib
@@ -23,14 +23,15 @@ from jaxbox.io.results import ResultFile, SweepResult, WriteResult
 PARQUET_COLUMNS: Mapping[str, str] = {
     "sweep": "string", "timestamp_ns": "int64", "label": "string", "score": "float32",
     "center_x": "float32", "center_y": "float32", "center_z": "float32",
-    "length": "float32", "width": "float32", "height": "float32", "yaw": "float32", "num_points": "int32",
+    "length": "float32", "width": "float32", "height": "float32", "yaw": "float32", "heading": "float32",
+    "front_probability": "float32", "num_points": "int32",
 }  # fmt: skip
 """The columns and Arrow's names of their types."""
 
 TRACK_COLUMNS: Mapping[str, str] = {
     "sequence": "string", "frame": "int32", "time_s": "float64", "id": "int32", **PARQUET_COLUMNS,
     "state": "string", "sight": "string", "confirmed": "bool_", "age": "int32", "hits": "int32",
-    "heading": "float32", "front_probability": "float32", "velocity_x": "float32", "velocity_y": "float32",
+    "velocity_x": "float32", "velocity_y": "float32",
     "speed": "float32", "turn_rate": "float32", "lateral_shift_m": "float32",
     "world_x": "float64", "world_y": "float64", "world_z": "float64",
 }  # fmt: skip
@@ -121,7 +122,7 @@ def box_rows(record: Mapping[str, Any]) -> list[dict[str, Any]]:
             "score": box["score"],
             **dict(zip(("center_x", "center_y", "center_z"), box["center"], strict=True)),
             **dict(zip(("length", "width", "height"), box["size"], strict=True)),
-            "yaw": box["yaw"],
+            **{name: box[name] for name in ("yaw", "heading", "front_probability")},
             "num_points": box["num_points"],
             **(_track_columns(record, box) if "id" in box else {}),
         }
@@ -131,7 +132,7 @@ def box_rows(record: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def _track_columns(record: Mapping[str, Any], box: Mapping[str, Any]) -> dict[str, Any]:
     """What the row of a track has besides that of a box."""
-    same = ("id", "state", "sight", "confirmed", "age", "hits", "heading", "front_probability", "speed")
+    same = ("id", "state", "sight", "confirmed", "age", "hits", "speed")
     world = np.array(record["T_world_sensor"]) @ [*box["center"], 1.0]
     return {
         **{name: record[name] for name in ("sequence", "frame", "time_s")},

@@ -64,6 +64,11 @@ from jaxbox.reference.filtering import (
     filter_outliers,
     select_points,
 )
+from jaxbox.reference.fronts import (
+    find_fronts,
+    front_log_odds,
+    profile_tops,
+)
 from jaxbox.reference.ground import (
     cell_minima,
     fit_ground_plane,
@@ -196,6 +201,7 @@ __all__ = [
     "filter_outliers",
     "find_cells",
     "find_clusters",
+    "find_fronts",
     "first_returns",
     "fit_ground_plane",
     "fit_ground_planes",
@@ -203,6 +209,7 @@ __all__ = [
     "fit_points",
     "fit_rectangles",
     "fits",
+    "front_log_odds",
     "gather_obstacles",
     "ground_elevation",
     "ground_support",
@@ -227,6 +234,7 @@ __all__ = [
     "plane_elevation",
     "point_agreement",
     "polygon_area",
+    "profile_tops",
     "propose_clusters",
     "rectangle_candidates",
     "remove_ground",

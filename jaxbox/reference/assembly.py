@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxbox.config import DetectorConfig, VehicleConfig
 from jaxbox.reference.completion import is_large
+from jaxbox.reference.fronts import find_fronts
 from jaxbox.reference.ground import ground_elevation
 from jaxbox.reference.rectangles import wrap_yaw
 from jaxbox.reference.scoring import distance_outside
@@ -38,6 +39,10 @@ class ReferenceDetections:
     """(k, 3) m: length, width, height."""
     yaw: np.ndarray
     """(k,) rad, in [-pi/2, pi/2)."""
+    heading: np.ndarray
+    """(k,) rad, in [-pi, pi]: where the front points."""
+    front_probability: np.ndarray
+    """(k,) in [.5, 1]."""
     score: np.ndarray
     """(k,) in [0, 1]."""
     label: np.ndarray
@@ -134,6 +139,16 @@ def assemble(
     component[obstacles.row], point_detection[obstacles.row] = found.maps[0].component, owner
     # NaN, the height of points that do not count, compares False.
     ground_mask = ground.height <= config.ground.min_height_m
+    yaw = np.array([wrap_yaw(yaw) for yaw in boxes[:, 4]])
+    labels = np.array([winner.hypothesis.label for winner in winners], int)
+    owned = [owner == detection for detection in range(len(winners))]
+    heading, front_probability = find_fronts(
+        [obstacles.xyz[mine, :2] for mine in owned],
+        [obstacles.height[mine] for mine in owned],
+        np.column_stack([boxes[:, :4], yaw]),
+        vertical[:, 1],
+        labels,
+    )
     counts = _count_points(found, config) | {
         "ground_points": int(ground_mask.sum()),
         "hull_vertices": max((len(hull) for hull in hulls), default=0),
@@ -141,9 +156,11 @@ def assemble(
     return ReferenceDetections(
         center=np.column_stack([boxes[:, :2], vertical[:, 0]]),
         size=np.column_stack([boxes[:, 2:4], vertical[:, 1]]),
-        yaw=np.array([wrap_yaw(yaw) for yaw in boxes[:, 4]]),
+        yaw=yaw,
+        heading=heading,
+        front_probability=front_probability,
         score=np.array([winner.score for winner in winners]),
-        label=np.array([winner.hypothesis.label for winner in winners], int),
+        label=labels,
         num_points=num_points,
         hulls=tuple(hulls),
         descriptors=tuple(descriptors),

@@ -96,6 +96,7 @@ def assemble(
     hulls: Hulls,
     num_points: jax.Array,
     descriptors: Descriptors,
+    fronts: tuple[jax.Array, jax.Array],
     first_return_m: jax.Array,
     config: DetectorConfig,
 ) -> Detections:
@@ -108,6 +109,7 @@ def assemble(
       hulls: of the points of K detections.
       num_points: (K,) int32, how many they are.
       descriptors: of their shapes.
+      fronts: (K,) float32 each: where they point, rad, and P(front).
       first_return_m: (A,) float32, see `Detections`.
       config: of the detector.
 
@@ -128,6 +130,8 @@ def assemble(
         center=kept.center,
         size=kept.size,
         yaw=kept.yaw,
+        heading=fronts[0],
+        front_probability=fronts[1],
         score=kept.score,
         label=kept.label,
         valid=kept.valid,

@@ -42,7 +42,7 @@ class FrameBoxes:
           detections: of one sweep, not a batch.
         """
         valid = np.asarray(detections.valid)
-        parts = [np.asarray(part)[valid] for part in (detections.center, detections.size, detections.yaw)]
+        parts = [np.asarray(part)[valid] for part in (detections.center, detections.size, detections.heading)]
         return cls(np.column_stack(parts).astype(float), np.asarray(detections.score, float)[valid])
 
     @classmethod
