@@ -28,14 +28,15 @@ from jaxbox.cluster import (
     ClusterError,
     DatasetReport,
     PartitionReport,
-    dataset,
     detect_dataset,
     sources,
     worker,
 )
+from jaxbox.cluster.detect_worker import DetectTask, DetectWorker
+from jaxbox.cluster.run import MANIFEST, joined_ray
 from jaxbox.cluster.sources import SweepReader, SweepRef, list_sweeps
 from jaxbox.cluster.store import Store
-from jaxbox.cluster.worker import Attempt, Partition, PartitionWorker, Task
+from jaxbox.cluster.worker import Attempt, Partition
 from jaxbox.config import DetectorConfig
 from jaxbox.io.parquet import PARQUET_COLUMNS
 from jaxbox.run import cache
@@ -225,7 +226,7 @@ def task_for(output, **changes):
         "num_threads": 1, "versions": versions(),
         "cache_folders": CacheFolders.of_this_process(),
     }  # fmt: skip
-    return Task(output=str(output), **{**fields, **changes})
+    return DetectTask(output=str(output), **{**fields, **changes})
 
 
 def partition_of(archive):
@@ -235,7 +236,7 @@ def partition_of(archive):
 
 
 def test_a_worker_writes_the_rows_of_the_local_run_and_its_report_is_in_the_file(archive, local, tmp_path):
-    report = PartitionWorker(task_for(tmp_path)).work(partition_of(archive))
+    report = DetectWorker(task_for(tmp_path)).work(partition_of(archive))
     assert rows_of(tmp_path).equals(local)
     assert (report.error, report.num_done, report.num_boxes) == (None, 5, len(local))
     assert [item["sweep"] for item in report.failures] == [BROKEN]
@@ -256,7 +257,7 @@ def test_after_a_death_each_sweep_goes_alone_and_one_that_kills_again_is_given_u
         assert (attempt.careful, attempt.num_before) == (True, number)
         assert not attempt.gives_up(KILLED_AT)
         attempt.begin(KILLED_AT)
-    report = PartitionWorker(task_for(tmp_path)).work(partition_of(archive))
+    report = DetectWorker(task_for(tmp_path)).work(partition_of(archive))
     assert report.num_deaths == 3
     assert [item["sweep"] for item in report.failures] == [BROKEN, KILLED_AT]
     assert "died 2 times" in report.failures[1]["reason"]
@@ -267,11 +268,11 @@ def test_after_a_death_each_sweep_goes_alone_and_one_that_kills_again_is_given_u
 
 def test_a_partition_that_cannot_be_written_is_reported_and_absent(archive, tmp_path, monkeypatch):
     monkeypatch.setattr(worker, "open_parquet", _fail)
-    report = PartitionWorker(task_for(tmp_path)).work(partition_of(archive))
+    report = DetectWorker(task_for(tmp_path)).work(partition_of(archive))
     assert (report.error, report.num_done) == ("OSError: the disk is full", 0)
     assert list(tmp_path.glob("*.parquet")) == []
     other = {**versions(), "jax": "0.0.1"}
-    report = PartitionWorker(task_for(tmp_path, versions=other)).work(partition_of(archive))
+    report = DetectWorker(task_for(tmp_path, versions=other)).work(partition_of(archive))
     assert f"the worker has jax {jax.__version__} for 0.0.1" in report.error
 
 
@@ -310,12 +311,12 @@ def served(archive, tmp_path_factory):
 @pytest.fixture(scope="module")
 def ray():
     """A local Ray of two cores, for all tests of this module."""
-    with dataset._ray(None, 2, 1) as started:
+    with joined_ray(None, 2, 1) as started:
         yield started
 
 
 def manifest_of(output):
-    return json.loads((output / dataset.MANIFEST).read_text())
+    return json.loads((output / MANIFEST).read_text())
 
 
 def kill_worker_of(output, partition):

@@ -1,6 +1,7 @@
 """Where the sweeps of an archive lie: listed by the driver and its tasks, read by the workers."""
 
 import collections
+import contextlib
 import dataclasses
 import itertools
 import os
@@ -56,6 +57,16 @@ def is_remote(source: str) -> bool:
     (True, False, True)
     """
     return ("://" in source and not source.startswith("file://")) or "::" in source
+
+
+def listed(sources: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> list[str]:
+    """One source or several, as texts.
+
+    >>> listed(pathlib.Path("drive"))
+    ['drive']
+    """
+    given = [sources] if isinstance(sources, str | os.PathLike) else sources
+    return [os.fspath(source) for source in given]
 
 
 def list_sweeps(sources: Sequence[str], topic: str | None, tasks: Tasks) -> list[SweepRef]:
@@ -150,6 +161,64 @@ def _path_of(url: str) -> pathlib.PurePosixPath:
     return pathlib.PurePosixPath(*steps)
 
 
+def group_refs(refs: Sequence[SweepRef]) -> list[tuple[str, tuple[SweepRef, ...]]]:
+    """Groups sweeps by the drive that they belong to, as `jaxbox.io.group_sequences`; nothing is read.
+
+    Args:
+      refs: as `list_sweeps` gives them. Those at URLs are of one drive where they lie in one folder.
+
+    Returns:
+      Name and sweeps of each drive, in the order of their first sweeps; names differ.
+
+    >>> [(name, len(group)) for name, group in group_refs([SweepRef("1", "s3://b/day/1.bin")])]
+    [('day', 1)]
+    """
+    sweeps = [listed_sweep(ref) for ref in refs]
+    by_name = {sweep.name: ref for sweep, ref in zip(sweeps, refs, strict=True)}
+    groups = io.group_sequences(sweeps)
+    return [(name, tuple(by_name[sweep.name] for sweep in group)) for name, group in groups]
+
+
+def listed_sweep(ref: SweepRef) -> io.Sweep:
+    """What is known of a sweep without fetching it.
+
+    Args:
+      ref: where it lies.
+
+    Returns:
+      Its name, drive, frame and time, as far as its path says. That of a URL has no points.
+    """
+    if ref.index is not None:
+        path = pathlib.Path(ref.url)
+        return io.Sweep(ref.name, path, sequence=path.stem, decode=_Unread(ref.url))
+    return dataclasses.replace(sweep_of(_place_of(ref.url)), name=ref.name)
+
+
+def _place_of(url: str) -> pathlib.Path:
+    """The path of a file, or of a URL as if it lay below a folder: another one for each archive and store."""
+    if not is_remote(url):
+        return pathlib.Path(url)
+    inside_out = url.split("::")
+    scheme = inside_out[0].partition("://")[0]
+    return _NOWHERE.joinpath(scheme, *(_path_of(part) for part in reversed(inside_out)))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Unread:
+    """Stands for the points of a message that was not read."""
+
+    path: str
+
+    def __call__(self) -> Points:
+        raise io.InputError(f"{self.path}: its messages have not been read.")
+
+    def timed(self) -> io.TimedPoints:
+        raise io.InputError(f"{self.path}: its messages have not been read.")
+
+    def header(self) -> tuple[int, str]:
+        return 0, ""
+
+
 def _named(url: str) -> SweepRef:
     return SweepRef(sweep_of(_NOWHERE / _path_of(url)).name, url)
 
@@ -168,7 +237,7 @@ def _distinct(refs: list[SweepRef]) -> list[SweepRef]:
         if ref.name in first:
             raise io.InputError(
                 f"{ref.url}: its sweep would be named {ref.name}, as that of {first[ref.name]}. "
-                "Detect the two one after the other, with an output of its own each."
+                "Go over the two one after the other, with an output of its own each."
             )
         first[ref.name] = ref.url
     return named
@@ -208,8 +277,9 @@ class SweepReader:
             points = sweep.read_points()
             return ReadSweep(points, sweep.timestamp_ns, sum(array.nbytes for array in points))
         if not is_remote(ref.url):
-            return _read_file(pathlib.Path(ref.url))
-        return self._read_copy(ref.url)
+            return _read_file(sweep_of(pathlib.Path(ref.url)))
+        with self.copied(ref.url) as sweep:
+            return _read_file(sweep)
 
     def _next_message(self, path: str, index: int) -> io.Sweep:
         """The sweep of a number in a recording; going on from the one before costs no new pass."""
@@ -226,7 +296,20 @@ class SweepReader:
         self._place = (path, index + 1)
         return sweep
 
-    def _read_copy(self, url: str) -> ReadSweep:
+    @contextlib.contextmanager
+    def copied(self, url: str) -> Iterator[io.Sweep]:
+        """Fetches a sweep, and what says more of it, for as long as the block lasts.
+
+        Args:
+          url: of its points.
+
+        Yields:
+          The sweep, on the local disk.
+
+        Raises:
+          InputError: of the block, naming the URL.
+          OSError: where it cannot be fetched.
+        """
         system, source = _open_system(url)
         with tempfile.TemporaryDirectory(prefix="jaxbox-") as folder:
             # Its own path below: format, name and time of a sweep follow from it.
@@ -235,7 +318,7 @@ class SweepReader:
             self._copy_companion(system, source, path)
             system.get_file(source, str(path))
             try:
-                return _read_file(path)
+                yield sweep_of(path)
             except io.InputError as error:
                 raise io.InputError(str(error).replace(str(path), url)) from error
 
@@ -255,10 +338,9 @@ class SweepReader:
             copy.write_bytes(content)
 
 
-def _read_file(path: pathlib.Path) -> ReadSweep:
-    sweep = sweep_of(path)
+def _read_file(sweep: io.Sweep) -> ReadSweep:
     points = sweep.read_points()
-    return ReadSweep(points, sweep.timestamp_ns, os.path.getsize(path))
+    return ReadSweep(points, sweep.timestamp_ns, os.path.getsize(sweep.points_path))
 
 
 def _companion(path: pathlib.Path) -> tuple[int, str] | None:
