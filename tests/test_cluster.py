@@ -23,7 +23,7 @@ from test_cli import make_small_sweep, run, write_points
 from test_io_formats import write_foxglove
 
 from jaxbox import io
-from jaxbox.cli import detect_ray
+from jaxbox.cli import detect_ray, ray_engine
 from jaxbox.cluster import (
     ClusterError,
     DatasetReport,
@@ -334,7 +334,7 @@ def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_p
 
     # Ctrl-C after the first partition.
     with monkeypatch.context() as patch:
-        patch.setattr(detect_ray, "_tell", _interrupt)
+        patch.setattr(ray_engine, "_tell", _interrupt)
         result = run(*command)
     assert result.exit_code == 1, result.output
     assert "--resume goes on" in result.stderr

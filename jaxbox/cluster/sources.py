@@ -14,7 +14,7 @@ from typing import Any
 
 from jaxbox import io
 from jaxbox._extras import require
-from jaxbox.io.points import Points
+from jaxbox.io.points import Points, TimedPoints
 from jaxbox.io.registry import POINT_FORMATS, format_of
 from jaxbox.io.sweeps import sweep_of
 
@@ -212,7 +212,7 @@ class _Unread:
     def __call__(self) -> Points:
         raise io.InputError(f"{self.path}: its messages have not been read.")
 
-    def timed(self) -> io.TimedPoints:
+    def timed(self) -> TimedPoints:
         raise io.InputError(f"{self.path}: its messages have not been read.")
 
     def header(self) -> tuple[int, str]:
@@ -281,6 +281,25 @@ class SweepReader:
         with self.copied(ref.url) as sweep:
             return _read_file(sweep)
 
+    def open_drive(self, refs: Sequence[SweepRef]) -> Sequence["io.Sweep | FetchedSweep"]:
+        """The sweeps of a drive, for `jaxbox.track`; nothing is read before it is asked for.
+
+        Args:
+          refs: all of one drive, as `group_refs` gives them.
+
+        Returns:
+          Those of a recording in the one pass that it takes; those at URLs are fetched one by one.
+
+        Raises:
+          InputError: where a recording cannot be opened.
+        """
+        first = refs[0]
+        if first.index is not None:
+            return io.open_sweeps(first.url, topic=self._topic)
+        if is_remote(first.url):
+            return [FetchedSweep(ref, self) for ref in refs]
+        return [listed_sweep(ref) for ref in refs]
+
     def _next_message(self, path: str, index: int) -> io.Sweep:
         """The sweep of a number in a recording; going on from the one before costs no new pass."""
         if self._place is None or self._place[0] != path or self._place[1] > index:
@@ -336,6 +355,43 @@ class SweepReader:
             copy = path.parents[levels - 1] / name
             copy.parent.mkdir(parents=True, exist_ok=True)
             copy.write_bytes(content)
+
+
+class FetchedSweep:
+    """A sweep at a URL, as `jaxbox.track` takes it: it is fetched when its points are asked for."""
+
+    def __init__(self, ref: SweepRef, reader: SweepReader) -> None:
+        """Fetches nothing yet.
+
+        Args:
+          ref: where it lies.
+          reader: fetches it.
+        """
+        known = listed_sweep(ref)
+        self._url, self._reader = ref.url, reader
+        self.name = ref.name
+        """Of the sweep."""
+        self.frame = known.frame
+        """Within its drive; None where its path does not say."""
+        self.timestamp_ns = known.timestamp_ns
+        """When it was taken, ns since 1970; known for some formats once it has been fetched."""
+        self.num_bytes = 0
+        """Of its file, once it has been fetched."""
+
+    def read_points(self) -> Points:
+        """Fetches the points; as `jaxbox.io.Sweep.read_points`."""
+        return self._read(io.Sweep.read_points)
+
+    def read_timed_points(self) -> TimedPoints:
+        """Fetches the points; as `jaxbox.io.Sweep.read_timed_points`."""
+        return self._read(io.Sweep.read_timed_points)
+
+    def _read(self, read: Callable[[io.Sweep], Any]) -> Any:
+        with self._reader.copied(self._url) as sweep:
+            points = read(sweep)
+            self.timestamp_ns = sweep.timestamp_ns
+            self.num_bytes = os.path.getsize(sweep.points_path)
+        return points
 
 
 def _read_file(sweep: io.Sweep) -> ReadSweep:
