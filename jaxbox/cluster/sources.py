@@ -112,20 +112,27 @@ def _list_local(paths: list[str], topic: str | None) -> list[SweepRef]:
     return refs
 
 
-def _units(source: str) -> list[str]:
-    """A URL as URLs of files and folders that can be listed separately."""
+def _units(source: str) -> list[tuple[str, bool]]:
+    """A URL as URLs of files and folders that can be listed separately, and which are known to be files."""
     system, path = _open_system(source)
     if "*" in path or "?" in path:
-        return [_url_of(source, system, found) for found in system.glob(path)]
+        return [(_url_of(source, system, found), False) for found in system.glob(path)]
     if not system.isdir(path):
-        return [source]
-    return [_url_of(source, system, found) for found in system.ls(path, detail=False)]
+        return [(source, True)]
+    found = [(str(item["name"]), item["type"] == "file") for item in system.ls(path, detail=True)]
+    # A server that lists pages may give a folder without its slash, but not one that is named as points are.
+    return [
+        (_url_of(source, system, name), is_file and format_of(_path_of(name)) is not None)
+        for name, is_file in found
+    ]
 
 
-def _find(url: str) -> list[tuple[int, str]]:
-    """Point files at a URL, each with the rank of its format."""
+def _find(unit: tuple[str, bool]) -> list[tuple[int, str]]:
+    """Point files of one of `_units`, each with the rank of its format."""
+    url, is_file = unit
     system, path = _open_system(url)
-    paths = system.find(path) if system.isdir(path) else [path]
+    # Over HTTP to ask whether a file is a folder fetches it.
+    paths = system.find(path) if not is_file and system.isdir(path) else [path]
     found = []
     for file in paths:
         point_format = format_of(_path_of(str(file)))
@@ -174,9 +181,10 @@ def group_refs(refs: Sequence[SweepRef]) -> list[tuple[str, tuple[SweepRef, ...]
     [('day', 1)]
     """
     sweeps = [listed_sweep(ref) for ref in refs]
-    by_name = {sweep.name: ref for sweep, ref in zip(sweeps, refs, strict=True)}
+    # Beside recordings, files of different folders may have one name.
+    refs_of = {(sweep.points_path, sweep.name): ref for sweep, ref in zip(sweeps, refs, strict=True)}
     groups = io.group_sequences(sweeps)
-    return [(name, tuple(by_name[sweep.name] for sweep in group)) for name, group in groups]
+    return [(name, tuple(refs_of[item.points_path, item.name] for item in group)) for name, group in groups]
 
 
 def listed_sweep(ref: SweepRef) -> io.Sweep:
