@@ -23,24 +23,30 @@ from test_cli import make_small_sweep, run, write_points
 from test_io_formats import write_foxglove
 
 from jaxbox import io
-from jaxbox.cli import detect_ray
+from jaxbox.cli import detect_ray, ray_engine
 from jaxbox.cluster import (
     ClusterError,
     DatasetReport,
+    DriveReport,
     PartitionReport,
-    dataset,
     detect_dataset,
     sources,
+    track_dataset,
     worker,
 )
-from jaxbox.cluster.sources import SweepReader, SweepRef, list_sweeps
+from jaxbox.cluster.detect_worker import DetectTask, DetectWorker
+from jaxbox.cluster.run import MANIFEST, joined_ray, plan
+from jaxbox.cluster.sources import SweepReader, SweepRef, group_refs, list_sweeps
 from jaxbox.cluster.store import Store
-from jaxbox.cluster.worker import Attempt, Partition, PartitionWorker, Task
-from jaxbox.config import DetectorConfig
+from jaxbox.cluster.track_worker import TrackTask, TrackWorker
+from jaxbox.cluster.worker import Attempt, Partition
+from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.io.parquet import PARQUET_COLUMNS
 from jaxbox.run import cache
 from jaxbox.run.cache import CacheFolders
+from jaxbox.run.carrier import estimated_source
 from jaxbox.run.versions import versions
+from jaxbox.tracking.poses import PoseSource
 
 # Ray Data's settings warn of their own old names.
 pytestmark = pytest.mark.filterwarnings("ignore::DeprecationWarning:ray")
@@ -225,7 +231,7 @@ def task_for(output, **changes):
         "num_threads": 1, "versions": versions(),
         "cache_folders": CacheFolders.of_this_process(),
     }  # fmt: skip
-    return Task(output=str(output), **{**fields, **changes})
+    return DetectTask(output=str(output), **{**fields, **changes})
 
 
 def partition_of(archive):
@@ -235,7 +241,7 @@ def partition_of(archive):
 
 
 def test_a_worker_writes_the_rows_of_the_local_run_and_its_report_is_in_the_file(archive, local, tmp_path):
-    report = PartitionWorker(task_for(tmp_path)).work(partition_of(archive))
+    report = DetectWorker(task_for(tmp_path)).work(partition_of(archive))
     assert rows_of(tmp_path).equals(local)
     assert (report.error, report.num_done, report.num_boxes) == (None, 5, len(local))
     assert [item["sweep"] for item in report.failures] == [BROKEN]
@@ -256,7 +262,7 @@ def test_after_a_death_each_sweep_goes_alone_and_one_that_kills_again_is_given_u
         assert (attempt.careful, attempt.num_before) == (True, number)
         assert not attempt.gives_up(KILLED_AT)
         attempt.begin(KILLED_AT)
-    report = PartitionWorker(task_for(tmp_path)).work(partition_of(archive))
+    report = DetectWorker(task_for(tmp_path)).work(partition_of(archive))
     assert report.num_deaths == 3
     assert [item["sweep"] for item in report.failures] == [BROKEN, KILLED_AT]
     assert "died 2 times" in report.failures[1]["reason"]
@@ -267,11 +273,11 @@ def test_after_a_death_each_sweep_goes_alone_and_one_that_kills_again_is_given_u
 
 def test_a_partition_that_cannot_be_written_is_reported_and_absent(archive, tmp_path, monkeypatch):
     monkeypatch.setattr(worker, "open_parquet", _fail)
-    report = PartitionWorker(task_for(tmp_path)).work(partition_of(archive))
+    report = DetectWorker(task_for(tmp_path)).work(partition_of(archive))
     assert (report.error, report.num_done) == ("OSError: the disk is full", 0)
     assert list(tmp_path.glob("*.parquet")) == []
     other = {**versions(), "jax": "0.0.1"}
-    report = PartitionWorker(task_for(tmp_path, versions=other)).work(partition_of(archive))
+    report = DetectWorker(task_for(tmp_path, versions=other)).work(partition_of(archive))
     assert f"the worker has jax {jax.__version__} for 0.0.1" in report.error
 
 
@@ -310,12 +316,12 @@ def served(archive, tmp_path_factory):
 @pytest.fixture(scope="module")
 def ray():
     """A local Ray of two cores, for all tests of this module."""
-    with dataset._ray(None, 2, 1) as started:
+    with joined_ray(None, 2, 1) as started:
         yield started
 
 
 def manifest_of(output):
-    return json.loads((output / dataset.MANIFEST).read_text())
+    return json.loads((output / MANIFEST).read_text())
 
 
 def kill_worker_of(output, partition):
@@ -333,7 +339,7 @@ def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_p
 
     # Ctrl-C after the first partition.
     with monkeypatch.context() as patch:
-        patch.setattr(detect_ray, "_tell", _interrupt)
+        patch.setattr(ray_engine, "_tell", _interrupt)
         result = run(*command)
     assert result.exit_code == 1, result.output
     assert "--resume goes on" in result.stderr
@@ -420,6 +426,272 @@ def test_what_the_workers_cannot_do_is_refused(tmp_path):
         assert expected in result.stderr
     with pytest.raises(ValueError, match="sweeps_per_partition is 0"):
         detect_dataset(tmp_path, tmp_path / "out", sweeps_per_partition=0)
+
+
+# --- drives ---------------------------------------------------------------------------------------
+
+LENGTHS = {"00": 4, "plain": 3}
+STEP_M = 1.0
+TRACKED = (*SETTINGS, "--track-set", "max_misses=3")
+
+
+@pytest.fixture(scope="module")
+def drives(tmp_path_factory):
+    """A drive past a street with poses, as the odometry benchmark has them, and one without."""
+    root = tmp_path_factory.mktemp("drives")
+    odometry = root / "sequences" / "00"
+    folders = (odometry / "velodyne", root / "plain")
+    for seed, folder, length in zip((0, 1), folders, LENGTHS.values(), strict=True):
+        street = make_small_sweep(seed)
+        for frame in range(length):
+            shifted = street.xyz - np.float32([STEP_M * frame, 0, 0])
+            folder.mkdir(parents=True, exist_ok=True)
+            io.write_bin(folder / f"{frame:06d}.bin", shifted, street.intensity)
+    (odometry / "calib.txt").write_text("Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n")
+    poses = [f"1 0 0 0 0 1 0 0 0 0 1 {STEP_M * frame}" for frame in range(LENGTHS["00"])]
+    (odometry / "poses.txt").write_text("\n".join(poses) + "\n")
+    return root
+
+
+def sources_of(root):
+    return [str(root / "sequences" / "00"), str(root / "plain")]
+
+
+def tracked_here(root, output, *arguments):
+    """What one process writes: the rows and the names of the sweeps, of each drive."""
+    arguments = ("--output", output, *TRACKED, "--format", "parquet", *arguments)
+    result = run("track", *sources_of(root), *arguments)
+    assert result.exit_code in (0, 1), result.output
+    return tables_of(output)
+
+
+def tables_of(output):
+    tables = {}
+    for path in output.glob("*.parquet"):
+        names = json.loads(pq.read_metadata(path).metadata[b"jaxbox.sweeps"])
+        tables[path.stem] = names, pq.read_table(path).replace_schema_metadata(None)
+    return tables
+
+
+def track_task_for(output, **changes):
+    fields = {
+        "config": DetectorConfig.paper(), "capacity": None, "min_score": 0.05, "topic": None,
+        "num_threads": 1, "versions": versions(), "cache_folders": CacheFolders.of_this_process(),
+        "track_config": TrackConfig(max_misses=3.0), "poses": "auto", "estimator": PoseSource.BOXES,
+        "rate_hz": 10.0, "max_tracks": 128, "smooth": False, "confirmed": False,
+    }  # fmt: skip
+    Store(output).make()
+    return TrackTask(output=str(output), **{**fields, **changes})
+
+
+def partitions_of(task, *given):
+    return plan(task, group_refs(list_sweeps(list(map(str, given)), None, serially)))
+
+
+def test_sweeps_are_grouped_by_drive_as_one_process_groups_them(drives, tmp_path):
+    write_foxglove(tmp_path / "plain.mcap", ["/front"])
+    given = [*sources_of(drives), str(tmp_path / "plain.mcap")]
+    expected = io.group_sequences(io.open_sweeps(given))
+    found = group_refs(list_sweeps(given, None, serially))
+    assert [name for name, _ in found] == [name for name, _ in expected]
+    assert len(found) == 3
+    for (_, refs), (_, sweeps) in zip(found, expected, strict=True):
+        assert [ref.url for ref in refs] == [str(sweep.points_path) for sweep in sweeps]
+
+
+def test_sweeps_at_urls_are_grouped_by_folder_and_archive(tmp_path):
+    for archive, number in (("a", 0), ("b", 1)):
+        with zipfile.ZipFile(tmp_path / f"{archive}.zip", "w") as archived:
+            archived.writestr(f"day/{number}.bin", b"")
+            archived.writestr(f"{number + 2}.bin", b"")
+    # By its name the second is the earlier one.
+    names = [f"log__LIDAR_TOP__{time}.pcd.bin" for time in (1533151603547590, 1533151603047590)]
+    refs = [SweepRef(name, f"memory://samples/LIDAR_TOP/{name}") for name in names]
+    patterns = ("zip://*.bin", "zip://day/*.bin")
+    urls = [f"{pattern}::{tmp_path}/{archive}.zip" for pattern in patterns for archive in "ab"]
+    refs += list_sweeps(urls, None, serially)
+    found = dict(group_refs(refs))
+    assert list(found) == ["log", "a.zip", "b.zip", "a.zip_day_day", "b.zip_day_day"]
+    assert [ref.name for ref in found["log"]] == names[::-1]
+    assert [ref.name for ref in found["b.zip_day_day"]] == ["1"]
+
+
+@pytest.mark.parametrize("options", [(), ("--smooth", "--confirmed")])
+def test_a_worker_writes_the_tracks_of_one_process(drives, tmp_path, options):
+    local = tracked_here(drives, tmp_path / "local", "--poses", "auto", *options)
+    assert {name: len(names) for name, (names, _) in local.items()} == LENGTHS
+    changes = {"smooth": True, "confirmed": True} if options else {}
+    task = track_task_for(tmp_path / "out", estimator=estimated_source(), **changes)
+    reports = [TrackWorker(task).work(part) for part in partitions_of(task, *sources_of(drives))]
+    assert [report.error for report in reports] == [None, None]
+    assert tables_of(tmp_path / "out") == local
+    first, second = reports
+    assert (first.pose_source, second.pose_source) == ("pose file", str(estimated_source()))
+    assert "poses.txt" in first.notes[0]
+    for name, report in zip(LENGTHS, reports, strict=True):
+        names, table = local[name]
+        assert (report.num_done, report.num_boxes) == (LENGTHS[name], len(table))
+        assert list(report.status) == list(report.track_status) == names
+        assert report.num_tracks == len(set(table["id"].to_pylist())) > 1
+        metadata = pq.read_metadata(tmp_path / "out" / f"{name}.parquet").metadata
+        assert DriveReport.from_json(metadata[worker.REPORT_KEY.encode()]) == report
+    assert second.num_bytes == sum(path.stat().st_size for path in (drives / "plain").glob("*.bin"))
+
+
+def test_a_drive_at_a_url_has_the_tracks_of_local_points_with_estimated_poses(drives, tmp_path):
+    local = tracked_here(drives, tmp_path / "local", "--poses", "boxes")
+    with zipfile.ZipFile(tmp_path / "archive.zip", "w") as archived:
+        for path in sorted(drives.rglob("*.bin")):
+            archived.write(path, path.relative_to(drives))
+    task = track_task_for(tmp_path / "out")
+    urls = [f"zip://{folder}::{tmp_path}/archive.zip" for folder in ("sequences/00", "plain")]
+    reports = [TrackWorker(task).work(part) for part in partitions_of(task, *urls)]
+    assert tables_of(tmp_path / "out") == local
+    for report in reports:
+        assert report.pose_source == "boxes"
+        assert "at a URL are not fetched" in report.notes[0]
+    assert reports[1].num_bytes == sum(path.stat().st_size for path in (drives / "plain").glob("*.bin"))
+    task = track_task_for(tmp_path / "registered", poses="kiss-icp")
+    if estimated_source() is PoseSource.KISS_ICP:
+        local = tracked_here(drives, tmp_path / "here", "--poses", "kiss-icp")
+        for part in partitions_of(task, *urls):
+            assert TrackWorker(task).work(part).error is None
+        assert tables_of(tmp_path / "registered") == local
+
+
+def test_a_recording_is_a_drive_and_what_is_read_before_it_breaks_off_is_there(tmp_path, monkeypatch):
+    write_foxglove(tmp_path / "drive.mcap", ["/front"])
+    arguments = ("--output", tmp_path / "local", *TRACKED, "--format", "parquet", "--poses", "boxes")
+    assert run("track", tmp_path / "drive.mcap", *arguments).exit_code == 0
+    task = track_task_for(tmp_path / "out")
+    (part,) = partitions_of(task, tmp_path / "drive.mcap")
+    report = TrackWorker(task).work(part)
+    assert report.error is None
+    assert report.num_bytes > 0
+    assert tables_of(tmp_path / "out") == tables_of(tmp_path / "local")
+    iterate = io.RecordedSweeps.__iter__
+
+    def break_off(self):
+        for index, sweep in enumerate(iterate(self)):
+            if index == len(self) - 1:
+                raise io.InputError(f"{self.path}: it is cut short")
+            yield sweep
+
+    monkeypatch.setattr(io.RecordedSweeps, "__iter__", break_off)
+    report = TrackWorker(task).work(part)
+    assert report.error is None
+    assert report.num_done == len(part.refs) - 1
+    assert [item["sweep"] for item in report.failures] == ["drive"]
+    assert report.failures[0]["reason"].endswith("it is cut short")
+
+
+def test_a_drive_that_kills_its_workers_is_given_up_and_one_without_points_has_no_file(drives, tmp_path):
+    task = track_task_for(tmp_path / "out")
+    store = Store(task.output)
+    parts = partitions_of(task, *sources_of(drives))
+    for _ in range(worker.MAX_DEATHS):
+        # What an attempt leaves whose worker died.
+        Attempt(store, "plain").begin("plain")
+    report = TrackWorker(task).work(parts[1])
+    assert (report.num_deaths, report.num_done) == (2, 0)
+    assert "died 2 times" in report.error
+    assert store.names() == []
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "0.bin").write_bytes(b"abc")
+    report = TrackWorker(task).work(partitions_of(task, tmp_path / "empty")[0])
+    assert "none of its sweeps went through" in report.error
+    assert [item["sweep"] for item in report.failures] == ["0"]
+    assert list((tmp_path / "out").glob("*.parquet")) == []
+
+
+def test_drives_on_ray_broken_mended_killed_and_resumed_have_the_tracks_of_one_process(ray, drives, tmp_path):
+    root, output = tmp_path / "drives", tmp_path / "out"
+    shutil.copytree(drives, root)
+    broken = root / "plain" / "000001.bin"
+    whole = broken.read_bytes()
+    broken.write_bytes(whole[:-3])
+    local = tracked_here(root, tmp_path / "local", "--poses", "boxes")
+    assert {name: len(names) for name, (names, _) in local.items()} == {"00": 4, "plain": 2}
+    with Server(tmp_path) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        url = f"http://127.0.0.1:{server.server_port}/drives/plain"
+        command = ("track", root / "sequences" / "00", url, "--output", output, *TRACKED, "--poses", "boxes")
+        command += ("--engine", "ray", "--jobs", "2")
+        result = run(*command, "--json")
+        assert result.exit_code == 1, result.output
+        assert tables_of(output) == local
+        lines = [json.loads(line) for line in result.stdout.splitlines()]
+        assert {line["name"]: line["num_sweeps"] for line in lines[:-1]} == LENGTHS
+        assert lines[-1]["summary"]["done"] == 6
+        manifest = manifest_of(output)
+        (failure,) = manifest["failures"]
+        assert (failure["sweep"], failure["url"]) == ("plain_000001", f"{url}/000001.bin")
+        assert "is not a multiple of 16" in failure["reason"]
+        assert (manifest["options"]["poses"], manifest["options"]["track"]["max_misses"]) == ("boxes", 3.0)
+        assert not manifest["finished"]
+
+        # The sweep is mended, only its drive is done again, and its worker dies in the middle.
+        broken.write_bytes(whole)
+        before = {path.name: path.stat().st_mtime_ns for path in output.glob("*.parquet")}
+        target, killed = "/drives/plain/000002.bin", []
+
+        def kill_once(path):
+            if path == target and not killed:
+                killed.append(path)
+                kill_worker_of(output, "plain")
+
+        server.before = kill_once
+        server.asked.clear()
+        result = run(*command, "--resume")
+        other = run(*command, "--resume", "--track-set", "max_misses=6", "--confirmed")
+        server.shutdown()
+    assert result.exit_code == 0, result.output
+    assert killed
+    assert server.asked[target] == 2, "and is read again by the worker that took its place"
+    assert "plain: 3 of 3 sweeps" in result.stdout
+    changed = [name for name, time in before.items() if (output / name).stat().st_mtime_ns != time]
+    assert changed == ["plain.parquet"]
+    manifest = manifest_of(output)
+    assert (manifest["finished"], manifest["num_skipped"], manifest["deaths"]) == (True, 1, {"plain": 1})
+    assert tables_of(output) == tracked_here(root, tmp_path / "mended", "--poses", "boxes")
+    names = ["00.parquet", "config.toml", "manifest.json", "plain.parquet"]
+    assert sorted(path.name for path in output.iterdir()) == names
+
+    # Other settings, and other drives, are not mixed with these.
+    assert other.exit_code == 2
+    assert "confirmed, track differ" in other.stderr.replace("\n", "")
+    result = run("track", root / "plain", *command[3:], "--resume")
+    assert result.exit_code == 2
+    assert "00.parquet belongs to" in result.stderr.replace("\n", "")
+
+
+def test_what_the_workers_cannot_do_for_drives_is_refused(drives, tmp_path):
+    common = ("track", drives / "plain", "--output", tmp_path / "out")
+    for arguments, expected in (
+        (("--engine", "ray", "--format", "kitti"), "write parquet"),
+        (("--engine", "ray", "--pictures"), "--pictures: the workers"),
+        (("--engine", "ray", "--video"), "--video: the workers"),
+        (("--engine", "ray", "--no-points"), "holds no points"),
+        (("--engine", "ray", "--coasting"), "--coasting: it is for KITTI text"),
+        (("--engine", "ray", "--level"), "takes sweeps as they are"),
+        (("--engine", "ray", "--sensor-at", "0", "0", "1"), "takes sweeps as they are"),
+        (("--engine", "ray", "--poses", "nowhere.txt"), "nowhere.txt: no such file or folder of poses"),
+        (("--engine", "ray", "--rate-hz", "0"), "--rate-hz is 0"),
+        (("--address", "auto"), "only --engine ray"),
+        (("--output", "s3://bucket/out"), "only --engine ray"),
+    ):
+        result = run(*common, *arguments)
+        assert result.exit_code == 2, result.output
+        assert expected in result.stderr
+    with pytest.raises(io.InputError, match=r"poses of a file are for points on a disk, and memory://a is"):
+        track_dataset("memory://a", tmp_path / "out", poses=drives / "sequences" / "00" / "poses.txt")
+    with pytest.raises(ValueError, match="max_tracks is 0"):
+        track_dataset(drives / "plain", tmp_path / "out", max_tracks=0)
+    with pytest.raises(ValueError, match="rate_hz is 0"):
+        track_dataset(drives / "plain", tmp_path / "out", rate_hz=0)
+
+
+# --- errors ---------------------------------------------------------------------------------------
 
 
 def test_without_ray_the_extra_is_named(tmp_path, monkeypatch):

@@ -1,6 +1,5 @@
 """The eight commands and their options; the work is done in the module of each."""
 
-import enum
 import pathlib
 from typing import Annotated
 
@@ -11,14 +10,17 @@ from jaxbox.cli.config_options import chosen_config, chosen_preset
 from jaxbox.cli.console import cache_warnings, input_errors, stdout
 from jaxbox.cli.demo import run_demo
 from jaxbox.cli.detect import DetectOptions, ResultFormat, run_detect
-from jaxbox.cli.detect_ray import RayOptions, run_detect_ray
+from jaxbox.cli.detect_ray import DetectRayOptions, run_detect_ray
 from jaxbox.cli.eval_command import evaluate
 from jaxbox.cli.export import Platform, run_export
 from jaxbox.cli.info import print_info
 from jaxbox.cli.options import (
     EXIT_CODES,
+    AddressOption,
     CapacityOption,
     DrivesOption,
+    Engine,
+    EngineOption,
     JsonOption,
     LevelOption,
     PresetOption,
@@ -29,6 +31,7 @@ from jaxbox.cli.options import (
     SettingsOption,
     TopicOption,
 )
+from jaxbox.cli.ray_engine import check_local
 from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.cli.sweep_info import print_sweep_info
 from jaxbox.cli.threads import compute_on_one_thread
@@ -40,14 +43,6 @@ from jaxbox.evaluation.copies import COPIES
 from jaxbox.evaluation.objectives import OBJECTIVES
 from jaxbox.io import InputError
 from jaxbox.run.cache import enable_cache
-
-
-class Engine(enum.StrEnum):
-    """What `detect` runs on."""
-
-    LOCAL = "local"
-    RAY = "ray"
-
 
 DETECT_EXAMPLES = """Examples:
 
@@ -177,12 +172,8 @@ def detect(
             "ray one a core.",
         ),
     ] = None,
-    engine: Annotated[
-        Engine, typer.Option(help="ray: workers of a Ray cluster, or of this machine; docs/cluster.md.")
-    ] = Engine.LOCAL,
-    address: Annotated[
-        str | None, typer.Option(help="Of the Ray cluster, such as auto; by default one is started here.")
-    ] = None,
+    engine: EngineOption = Engine.LOCAL,
+    address: AddressOption = None,
     sweeps_per_partition: Annotated[
         int | None,
         typer.Option(
@@ -206,16 +197,13 @@ def detect(
     with input_errors():
         config = chosen_config(preset, settings, changes or [], sensor=sensor)
         if engine is Engine.RAY:
-            if level or sensor_at is not None:
-                raise InputError(
-                    "--level and --sensor-at: --engine ray takes sweeps as they are; leave these out."
-                )
-            ray_options = RayOptions(
+            ray_options = DetectRayOptions(
                 output=output,
                 config=config,
                 formats=frozenset(result_format or []),
                 pictures=bool(pictures),
                 points=points,
+                mounted=level or sensor_at is not None,
                 address=address,
                 jobs=jobs,
                 sweeps_per_partition=sweeps_per_partition or SWEEPS_PER_PARTITION,
@@ -227,15 +215,10 @@ def detect(
                 json=json,
             )
             raise typer.Exit(run_detect_ray(paths, ray_options))
-        if address is not None:
-            raise InputError("--address: only --engine ray has one; add it, or leave the address out.")
+        check_local(output, address)
         if sweeps_per_partition is not None:
             raise InputError(
                 "--sweeps-per-partition: only --engine ray writes partitions; add it, or leave this out."
-            )
-        if "://" in output:
-            raise InputError(
-                f"--output {output}: only --engine ray writes to a URL; add it, or give a folder."
             )
         options = DetectOptions(
             output=pathlib.Path(output),

@@ -1,5 +1,6 @@
 """Options that several commands share, and what they say at the end of their help."""
 
+import enum
 import math
 import pathlib
 from typing import Annotated
@@ -13,6 +14,20 @@ EXIT_CODES = (
     "2 the input or an option cannot be used, or results cannot be written."
 )
 
+
+class Engine(enum.StrEnum):
+    """What a command runs on."""
+
+    LOCAL = "local"
+    RAY = "ray"
+
+
+EngineOption = Annotated[
+    Engine, typer.Option(help="ray: workers of a Ray cluster, or of this machine; docs/cluster.md.")
+]
+AddressOption = Annotated[
+    str | None, typer.Option(help="Of the Ray cluster, such as auto; by default one is started here.")
+]
 PresetOption = Annotated[
     str | None,
     typer.Option(

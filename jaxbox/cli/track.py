@@ -25,16 +25,14 @@ from jaxbox.cli.track_report import SequenceReport, TrackReport
 from jaxbox.cli.track_results import SequenceFiles, TrackFormat
 from jaxbox.config import TrackConfig
 from jaxbox.config.fields import all_fields
+from jaxbox.io.drive_records import DriveRecords
+from jaxbox.io.poses import choose_poses
 from jaxbox.io.results import SweepResult
-from jaxbox.run.carrier import ESTIMATED, without_points
+from jaxbox.run.carrier import without_points
 from jaxbox.run.tracking import TrackedSweep, smooth_tracks, track
 from jaxbox.tracking.poses import Poses, PoseSource
 from jaxbox.tracking.trails import Trails
 from jaxbox.viz import draw_drive
-
-AUTO = "auto"
-"""Poses that the data set or recording holds, else those of kiss-icp or of the boxes."""
-_NS_PER_S = 10**9
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -46,7 +44,7 @@ class TrackOptions(RunOptions):
     formats: frozenset[TrackFormat]
     """What to write."""
     poses: str
-    """`AUTO`, a word of `ESTIMATED`, or a file or folder."""
+    """As `jaxbox.io.poses.choose_poses` takes them."""
     rate_hz: float
     """Sweeps a second where nothing says when they were taken."""
     max_tracks: int
@@ -181,7 +179,7 @@ class _Drive:
         self._sweeps, self._report, self._options = sweeps, report, options
         self._files, self._advance = files, advance
         self._trails = Trails()
-        self._start_ns: int | None = None
+        self._records = DriveRecords(report.name, min_score=options.min_score, confirmed=options.confirmed)
 
     def go(self) -> None:
         """Tracks and writes; ends early, with what is done, where it is interrupted or breaks off."""
@@ -222,21 +220,12 @@ class _Drive:
         )
 
     def _find_poses(self) -> Poses | PoseSource | None:
-        asked = self._options.poses
-        if asked in ESTIMATED:
-            return PoseSource(asked)
-        path = None if asked == AUTO else asked
-        try:
-            found = io.find_poses(self._sweeps, poses_path=path, report=self._tell)
-        except (io.InputError, ImportError) as error:
-            if path is not None:
-                raise
-            # Poses of its own are a convenience: without them it goes as for a recording that has none.
-            print_warning(f"{self._report.name}: {error} Poses are estimated instead.")
-            return None
-        if found is None and path is not None:
-            raise io.InputError(f"--poses {path}: no poses of {self._report.name} there.")
-        return found
+        return choose_poses(
+            self._sweeps,
+            self._options.poses,
+            report=self._tell,
+            warn=lambda sentence: print_warning(f"{self._report.name}: {sentence}"),
+        )
 
     def _tell(self, sentence: str) -> None:
         if self._options.speaks:
@@ -246,17 +235,7 @@ class _Drive:
         """Adds a sweep to the files; a failure to read what belongs to it is one of the sweep."""
         kept = tracked.sweep
         assert isinstance(kept, KeptSweep)
-        frame = index if kept.frame is None else kept.frame
-        if self._start_ns is None:
-            self._start_ns = tracked.time_ns
-        record = io.tracks_record(
-            tracked,
-            sequence=self._report.name,
-            frame=frame,
-            time_s=(tracked.time_ns - self._start_ns) / _NS_PER_S,
-            min_score=self._options.min_score,
-            confirmed=self._options.confirmed,
-        )
+        record = self._records.record(index, tracked)
         try:
             result = self._gather(kept, tracked, record)
         except (io.InputError, OSError) as error:

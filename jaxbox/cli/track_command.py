@@ -1,14 +1,17 @@
 """Options of ``jaxbox track``."""
 
 import pathlib
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from jaxbox.cli.config_options import chosen_config, chosen_track_config, complete_track_setting
 from jaxbox.cli.console import input_errors
 from jaxbox.cli.options import (
+    AddressOption,
     CapacityOption,
+    Engine,
+    EngineOption,
     JsonOption,
     LevelOption,
     PresetOption,
@@ -19,9 +22,12 @@ from jaxbox.cli.options import (
     SettingsOption,
     TopicOption,
 )
+from jaxbox.cli.ray_engine import check_local
 from jaxbox.cli.report import SHOWN_MIN_SCORE
-from jaxbox.cli.track import AUTO, TrackOptions, run_track
+from jaxbox.cli.track import TrackOptions, run_track
+from jaxbox.cli.track_ray import TrackRayOptions, run_track_ray
 from jaxbox.cli.track_results import TrackFormat
+from jaxbox.io.poses import AUTO
 from jaxbox.run.carrier import ESTIMATED
 from jaxbox.run.tracking import MAX_TRACKS, RATE_HZ
 
@@ -32,6 +38,8 @@ jaxbox track KITTI/training --output tracks --video
 jaxbox track drive.mcap --output tracks --format jsonl --format mcap --smooth
 
 jaxbox track drive.bag --output tracks --poses odometry.txt --format csv
+
+jaxbox track s3://bucket/drives --output s3://bucket/tracks --engine ray --address auto --resume
 
 jaxbox track 'sweeps/*.pcd' --output tracks --rate-hz 20 --poses boxes --track-set max_misses=6
 
@@ -52,7 +60,10 @@ def track(
         list[str], typer.Argument(help="What `detect` takes; each folder or recording is a drive.")
     ],
     *,
-    output: Annotated[pathlib.Path, typer.Option(metavar="FOLDER", help="For results, pictures and videos.")],
+    output: Annotated[
+        str,
+        typer.Option(metavar="FOLDER", help="For results, pictures and videos; with ray a URL will do."),
+    ],
     poses: Annotated[
         str,
         typer.Option(
@@ -70,15 +81,18 @@ def track(
     ] = False,
     result_format: Annotated[
         list[TrackFormat] | None,
-        typer.Option("--format", help="What to write; repeatable. By default kitti."),
+        typer.Option("--format", help="What to write; repeatable. By default kitti, or with ray parquet."),
     ] = None,
     video: Annotated[
         bool, typer.Option("--video", help="A video of each drive: from above, and the camera's image.")
     ] = False,
     pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw each sweep.")] = False,
     points: Annotated[
-        bool, typer.Option("--points/--no-points", help="Put the points into MCAP and rerun files too.")
-    ] = True,
+        bool | None,
+        typer.Option(
+            "--points/--no-points", help="Put the points into MCAP and rerun files too. By default yes."
+        ),
+    ] = None,
     confirmed: Annotated[
         bool,
         typer.Option(
@@ -119,7 +133,16 @@ def track(
     sensor_at: SensorAtOption = None,
     level: LevelOption = False,
     capacity: CapacityOption = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes that detect; results do not depend on it.")] = 1,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Processes that detect; results do not depend on it. By default 1. With ray those that "
+            "track, each a drive of its own; by default one a core.",
+        ),
+    ] = None,
+    engine: EngineOption = Engine.LOCAL,
+    address: AddressOption = None,
     resume: Annotated[
         bool, typer.Option("--resume", help="Pass over drives whose results in OUTPUT are complete.")
     ] = False,
@@ -131,33 +154,50 @@ def track(
     Results are OUTPUT/DRIVE.txt (kitti), .jsonl, .parquet, .csv, .mcap (for Foxglove), .rrd (for rerun) and
     .mp4, pictures OUTPUT/pictures/SWEEP_tracks.png. Every file is written whole or not at all. The exact
     settings are in OUTPUT/config.toml, those of the tracker, versions and failures in OUTPUT/run.json. A
-    broken sweep is reported and the others go on; of an interrupted drive there is what was done.
+    broken sweep is reported and the others go on; of an interrupted drive there is what was done. With
+    --engine ray, paths and OUTPUT may be URLs, results are OUTPUT/DRIVE.parquet, OUTPUT/manifest.json tells
+    what became of every sweep, and an interrupted drive has no file.
     """
     with input_errors():
         if not rate_hz > 0:
             raise typer.BadParameter(f"--rate-hz is {rate_hz:g}; give sweeps a second, such as 10.")
+        common: dict[str, Any] = {
+            "config": chosen_config(preset, settings, changes or [], sensor=sensor),
+            "track_config": chosen_track_config(track_changes or []),
+            "poses": poses,
+            "rate_hz": rate_hz,
+            "max_tracks": max_tracks,
+            "smooth": smooth,
+            "confirmed": confirmed,
+            "coasting": coasting,
+            "topic": topic,
+            "capacity": capacity,
+            "min_score": min_score,
+            "pictures": pictures,
+            "video": video,
+            "resume": resume,
+            "quiet": quiet,
+            "json": json,
+        }
+        if engine is Engine.RAY:
+            ray_options = TrackRayOptions(
+                output=output,
+                formats=frozenset(result_format or []),
+                points=points,
+                mounted=level or sensor_at is not None,
+                address=address,
+                jobs=jobs,
+                **common,
+            )
+            raise typer.Exit(run_track_ray(paths, ray_options))
+        check_local(output, address)
         options = TrackOptions(
-            output=output,
-            config=chosen_config(preset, settings, changes or [], sensor=sensor),
-            track_config=chosen_track_config(track_changes or []),
+            output=pathlib.Path(output),
             formats=frozenset(result_format or [TrackFormat.KITTI]),
-            poses=poses,
-            rate_hz=rate_hz,
-            max_tracks=max_tracks,
-            smooth=smooth,
-            confirmed=confirmed,
-            coasting=coasting,
-            topic=topic,
+            points=True if points is None else points,
             sensor_at=sensor_at,
             level=level,
-            capacity=capacity,
-            min_score=min_score,
-            points=points,
-            pictures=pictures,
-            video=video,
-            jobs=jobs,
-            resume=resume,
-            quiet=quiet,
-            json=json,
+            jobs=jobs or 1,
+            **common,
         )
         raise typer.Exit(run_track(paths, options))

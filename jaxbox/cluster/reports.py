@@ -3,7 +3,7 @@
 import dataclasses
 import json
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Generic, Self, TypeVar
 
 
 @dataclasses.dataclass(kw_only=True)
@@ -44,12 +44,20 @@ class PartitionReport:
         """Sweeps that are in its file, also those without boxes."""
         return len(self.status)
 
+    def add_failure(self, sweep: str, url: str, reason: str) -> None:
+        """Notes a sweep that did not go through."""
+        self.failures.append({"sweep": sweep, "url": url, "reason": reason})
+
+    def failed(self, reason: str) -> Self:
+        """The report of a partition without a file."""
+        return dataclasses.replace(self, status={}, num_boxes=0, error=reason)
+
     def to_json(self) -> str:
         """All fields as a JSON object."""
         return json.dumps(dataclasses.asdict(self), allow_nan=False)
 
     @classmethod
-    def from_json(cls, text: str | bytes) -> "PartitionReport":
+    def from_json(cls, text: str | bytes) -> Self:
         """What `to_json` wrote.
 
         Raises:
@@ -63,10 +71,31 @@ class PartitionReport:
 
 
 @dataclasses.dataclass(kw_only=True)
-class DatasetReport:
+class DriveReport(PartitionReport):
+    """One drive that was tracked. The tracker's seconds are in ``seconds`` alone, those of compiling too."""
+
+    pose_source: str = ""
+    """Where its poses are from, in words."""
+    notes: list[str] = dataclasses.field(default_factory=list)
+    """Sentences on the poses: which were found, and why others were not used."""
+    num_tracks: int = 0
+    """Ids in its file; ``num_boxes`` are its rows."""
+    track_status: dict[str, int] = dataclasses.field(default_factory=dict)
+    """`jaxbox.TrackStatus` bits of each sweep that is done, by its name."""
+
+    def failed(self, reason: str) -> Self:
+        """The report of a drive without a file."""
+        return dataclasses.replace(super().failed(reason), num_tracks=0, track_status={})
+
+
+AnyReport = TypeVar("AnyReport", bound=PartitionReport)
+
+
+@dataclasses.dataclass(kw_only=True)
+class DatasetReport(Generic[AnyReport]):
     """A whole run."""
 
-    partitions: list[PartitionReport]
+    partitions: list[AnyReport]
     """In the order of the sweeps; those that an earlier run finished among them."""
     num_skipped: int = 0
     """Partitions that an earlier run had finished."""

@@ -1,6 +1,7 @@
 """Where the sweeps of an archive lie: listed by the driver and its tasks, read by the workers."""
 
 import collections
+import contextlib
 import dataclasses
 import itertools
 import os
@@ -13,7 +14,7 @@ from typing import Any
 
 from jaxbox import io
 from jaxbox._extras import require
-from jaxbox.io.points import Points
+from jaxbox.io.points import Points, TimedPoints
 from jaxbox.io.registry import POINT_FORMATS, format_of
 from jaxbox.io.sweeps import sweep_of
 
@@ -56,6 +57,16 @@ def is_remote(source: str) -> bool:
     (True, False, True)
     """
     return ("://" in source and not source.startswith("file://")) or "::" in source
+
+
+def listed(sources: str | os.PathLike[str] | Sequence[str | os.PathLike[str]]) -> list[str]:
+    """One source or several, as texts.
+
+    >>> listed(pathlib.Path("drive"))
+    ['drive']
+    """
+    given = [sources] if isinstance(sources, str | os.PathLike) else sources
+    return [os.fspath(source) for source in given]
 
 
 def list_sweeps(sources: Sequence[str], topic: str | None, tasks: Tasks) -> list[SweepRef]:
@@ -101,20 +112,27 @@ def _list_local(paths: list[str], topic: str | None) -> list[SweepRef]:
     return refs
 
 
-def _units(source: str) -> list[str]:
-    """A URL as URLs of files and folders that can be listed separately."""
+def _units(source: str) -> list[tuple[str, bool]]:
+    """A URL as URLs of files and folders that can be listed separately, and which are known to be files."""
     system, path = _open_system(source)
     if "*" in path or "?" in path:
-        return [_url_of(source, system, found) for found in system.glob(path)]
+        return [(_url_of(source, system, found), False) for found in system.glob(path)]
     if not system.isdir(path):
-        return [source]
-    return [_url_of(source, system, found) for found in system.ls(path, detail=False)]
+        return [(source, True)]
+    found = [(str(item["name"]), item["type"] == "file") for item in system.ls(path, detail=True)]
+    # A server that lists pages may give a folder without its slash, but not one that is named as points are.
+    return [
+        (_url_of(source, system, name), is_file and format_of(_path_of(name)) is not None)
+        for name, is_file in found
+    ]
 
 
-def _find(url: str) -> list[tuple[int, str]]:
-    """Point files at a URL, each with the rank of its format."""
+def _find(unit: tuple[str, bool]) -> list[tuple[int, str]]:
+    """Point files of one of `_units`, each with the rank of its format."""
+    url, is_file = unit
     system, path = _open_system(url)
-    paths = system.find(path) if system.isdir(path) else [path]
+    # Over HTTP to ask whether a file is a folder fetches it.
+    paths = system.find(path) if not is_file and system.isdir(path) else [path]
     found = []
     for file in paths:
         point_format = format_of(_path_of(str(file)))
@@ -150,6 +168,65 @@ def _path_of(url: str) -> pathlib.PurePosixPath:
     return pathlib.PurePosixPath(*steps)
 
 
+def group_refs(refs: Sequence[SweepRef]) -> list[tuple[str, tuple[SweepRef, ...]]]:
+    """Groups sweeps by the drive that they belong to, as `jaxbox.io.group_sequences`; nothing is read.
+
+    Args:
+      refs: as `list_sweeps` gives them. Those at URLs are of one drive where they lie in one folder.
+
+    Returns:
+      Name and sweeps of each drive, in the order of their first sweeps; names differ.
+
+    >>> [(name, len(group)) for name, group in group_refs([SweepRef("1", "s3://b/day/1.bin")])]
+    [('day', 1)]
+    """
+    sweeps = [listed_sweep(ref) for ref in refs]
+    # Beside recordings, files of different folders may have one name.
+    refs_of = {(sweep.points_path, sweep.name): ref for sweep, ref in zip(sweeps, refs, strict=True)}
+    groups = io.group_sequences(sweeps)
+    return [(name, tuple(refs_of[item.points_path, item.name] for item in group)) for name, group in groups]
+
+
+def listed_sweep(ref: SweepRef) -> io.Sweep:
+    """What is known of a sweep without fetching it.
+
+    Args:
+      ref: where it lies.
+
+    Returns:
+      Its name, drive, frame and time, as far as its path says. That of a URL has no points.
+    """
+    if ref.index is not None:
+        path = pathlib.Path(ref.url)
+        return io.Sweep(ref.name, path, sequence=path.stem, decode=_Unread(ref.url))
+    return dataclasses.replace(sweep_of(_place_of(ref.url)), name=ref.name)
+
+
+def _place_of(url: str) -> pathlib.Path:
+    """The path of a file, or of a URL as if it lay below a folder: another one for each archive and store."""
+    if not is_remote(url):
+        return pathlib.Path(url)
+    inside_out = url.split("::")
+    scheme = inside_out[0].partition("://")[0]
+    return _NOWHERE.joinpath(scheme, *(_path_of(part) for part in reversed(inside_out)))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Unread:
+    """Stands for the points of a message that was not read."""
+
+    path: str
+
+    def __call__(self) -> Points:
+        raise io.InputError(f"{self.path}: its messages have not been read.")
+
+    def timed(self) -> TimedPoints:
+        raise io.InputError(f"{self.path}: its messages have not been read.")
+
+    def header(self) -> tuple[int, str]:
+        return 0, ""
+
+
 def _named(url: str) -> SweepRef:
     return SweepRef(sweep_of(_NOWHERE / _path_of(url)).name, url)
 
@@ -168,7 +245,7 @@ def _distinct(refs: list[SweepRef]) -> list[SweepRef]:
         if ref.name in first:
             raise io.InputError(
                 f"{ref.url}: its sweep would be named {ref.name}, as that of {first[ref.name]}. "
-                "Detect the two one after the other, with an output of its own each."
+                "Go over the two one after the other, with an output of its own each."
             )
         first[ref.name] = ref.url
     return named
@@ -208,8 +285,28 @@ class SweepReader:
             points = sweep.read_points()
             return ReadSweep(points, sweep.timestamp_ns, sum(array.nbytes for array in points))
         if not is_remote(ref.url):
-            return _read_file(pathlib.Path(ref.url))
-        return self._read_copy(ref.url)
+            return _read_file(sweep_of(pathlib.Path(ref.url)))
+        with self.copied(ref.url) as sweep:
+            return _read_file(sweep)
+
+    def open_drive(self, refs: Sequence[SweepRef]) -> Sequence["io.Sweep | FetchedSweep"]:
+        """The sweeps of a drive, for `jaxbox.track`; nothing is read before it is asked for.
+
+        Args:
+          refs: all of one drive, as `group_refs` gives them.
+
+        Returns:
+          Those of a recording in the one pass that it takes; those at URLs are fetched one by one.
+
+        Raises:
+          InputError: where a recording cannot be opened.
+        """
+        first = refs[0]
+        if first.index is not None:
+            return io.open_sweeps(first.url, topic=self._topic)
+        if is_remote(first.url):
+            return [FetchedSweep(ref, self) for ref in refs]
+        return [listed_sweep(ref) for ref in refs]
 
     def _next_message(self, path: str, index: int) -> io.Sweep:
         """The sweep of a number in a recording; going on from the one before costs no new pass."""
@@ -226,7 +323,20 @@ class SweepReader:
         self._place = (path, index + 1)
         return sweep
 
-    def _read_copy(self, url: str) -> ReadSweep:
+    @contextlib.contextmanager
+    def copied(self, url: str) -> Iterator[io.Sweep]:
+        """Fetches a sweep, and what says more of it, for as long as the block lasts.
+
+        Args:
+          url: of its points.
+
+        Yields:
+          The sweep, on the local disk.
+
+        Raises:
+          InputError: of the block, naming the URL.
+          OSError: where it cannot be fetched.
+        """
         system, source = _open_system(url)
         with tempfile.TemporaryDirectory(prefix="jaxbox-") as folder:
             # Its own path below: format, name and time of a sweep follow from it.
@@ -235,7 +345,7 @@ class SweepReader:
             self._copy_companion(system, source, path)
             system.get_file(source, str(path))
             try:
-                return _read_file(path)
+                yield sweep_of(path)
             except io.InputError as error:
                 raise io.InputError(str(error).replace(str(path), url)) from error
 
@@ -255,10 +365,46 @@ class SweepReader:
             copy.write_bytes(content)
 
 
-def _read_file(path: pathlib.Path) -> ReadSweep:
-    sweep = sweep_of(path)
+class FetchedSweep:
+    """A sweep at a URL, as `jaxbox.track` takes it: it is fetched when its points are asked for."""
+
+    def __init__(self, ref: SweepRef, reader: SweepReader) -> None:
+        """Fetches nothing yet.
+
+        Args:
+          ref: where it lies.
+          reader: fetches it.
+        """
+        known = listed_sweep(ref)
+        self._url, self._reader = ref.url, reader
+        self.name = ref.name
+        """Of the sweep."""
+        self.frame = known.frame
+        """Within its drive; None where its path does not say."""
+        self.timestamp_ns = known.timestamp_ns
+        """When it was taken, ns since 1970; known for some formats once it has been fetched."""
+        self.num_bytes = 0
+        """Of its file, once it has been fetched."""
+
+    def read_points(self) -> Points:
+        """Fetches the points; as `jaxbox.io.Sweep.read_points`."""
+        return self._read(io.Sweep.read_points)
+
+    def read_timed_points(self) -> TimedPoints:
+        """Fetches the points; as `jaxbox.io.Sweep.read_timed_points`."""
+        return self._read(io.Sweep.read_timed_points)
+
+    def _read(self, read: Callable[[io.Sweep], Any]) -> Any:
+        with self._reader.copied(self._url) as sweep:
+            points = read(sweep)
+            self.timestamp_ns = sweep.timestamp_ns
+            self.num_bytes = os.path.getsize(sweep.points_path)
+        return points
+
+
+def _read_file(sweep: io.Sweep) -> ReadSweep:
     points = sweep.read_points()
-    return ReadSweep(points, sweep.timestamp_ns, os.path.getsize(path))
+    return ReadSweep(points, sweep.timestamp_ns, os.path.getsize(sweep.points_path))
 
 
 def _companion(path: pathlib.Path) -> tuple[int, str] | None:

@@ -19,10 +19,48 @@ from jaxbox.io.pose_track import PoseTrack, UnusableSource
 from jaxbox.io.recorded_poses import collect_poses, odometry_poses, tf_poses
 from jaxbox.io.sweep import Sweep
 from jaxbox.io.sweeps import recording_format
+from jaxbox.run.carrier import ESTIMATED
 from jaxbox.tracking.poses import Poses, PoseSource, orthonormal_pose
 
+AUTO = "auto"
+"""Asks for poses that the data set or recording holds, and estimated ones where there are none."""
 Report = Callable[[str], None]
 """Is told, in a sentence, which source was used, and why others were not."""
+
+
+def choose_poses(
+    sweeps: Sequence[Sweep], asked: str, *, report: Report | None = None, warn: Report
+) -> Poses | PoseSource | None:
+    """The poses of one sequence by what was asked for, as the programs that track take it.
+
+    Args:
+      sweeps: as `find_poses` takes them.
+      asked: `AUTO`, a word of `jaxbox.run.carrier.ESTIMATED`, or a file or folder.
+      report: as `find_poses` takes it.
+      warn: is told why poses of the data set or recording cannot be used.
+
+    Returns:
+      The poses, or how they are to be estimated; None where it is not said how.
+
+    Raises:
+      InputError: as `find_poses`, where a file or folder is asked for, and where that holds none.
+
+    >>> choose_poses([], "boxes", warn=print)
+    <PoseSource.BOXES: 'boxes'>
+    """
+    if asked in ESTIMATED:
+        return PoseSource(asked)
+    if asked != AUTO:
+        found = find_poses(sweeps, poses_path=asked, report=report)
+        if found is None:
+            raise InputError(f"{asked}: no poses of these sweeps there.")
+        return found
+    try:
+        return find_poses(sweeps, report=report)
+    except (InputError, ImportError) as error:
+        # Poses of its own are a convenience: without them it goes as for a recording that has none.
+        warn(f"{error} Poses are estimated instead.")
+        return None
 
 
 @dataclasses.dataclass(frozen=True)

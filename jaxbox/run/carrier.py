@@ -35,6 +35,11 @@ class Carrier(Protocol):
         ...
 
 
+def estimated_source() -> PoseSource:
+    """How poses are estimated where nobody says how: kiss-icp where it is installed, else the boxes."""
+    return PoseSource.KISS_ICP if importlib.util.find_spec("kiss_icp") else PoseSource.BOXES
+
+
 def make_carrier(poses: Poses | np.ndarray | PoseSource | str | None) -> Carrier:
     """The source of poses that was asked for.
 
@@ -50,7 +55,7 @@ def make_carrier(poses: Poses | np.ndarray | PoseSource | str | None) -> Carrier
       ImportError: for "kiss-icp" without the extra ``track``.
     """
     if poses is None:
-        poses = PoseSource.KISS_ICP if importlib.util.find_spec("kiss_icp") else PoseSource.BOXES
+        poses = estimated_source()
     if isinstance(poses, str):
         if poses not in ESTIMATED:
             raise ValueError(f"poses is {poses!r}; give an array, or one of {', '.join(ESTIMATED)}.")

@@ -1,0 +1,192 @@
+"""What the commands that run on a Ray cluster have in common: their options, and what they say."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from typing import Any
+
+from rich.progress import Progress
+
+from jaxbox.cli.console import (
+    ExitCode,
+    make_progress,
+    print_error,
+    stderr,
+    stdout,
+    stoppable,
+)
+from jaxbox.cluster import ClusterError, DatasetReport, DriveReport, PartitionReport
+from jaxbox.config import DetectorConfig
+from jaxbox.io import InputError
+
+_PARQUET = "parquet"
+OnReport = Callable[[PartitionReport, int], None]
+"""Is told of each partition that is done, and of how many there are to do."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RayOptions:
+    """Options of ``jaxbox detect`` and ``track`` that this engine takes; the commands' help explains them."""
+
+    output: str
+    """Folder or URL of the results."""
+    config: DetectorConfig
+    """The detector's settings."""
+    formats: frozenset[str]
+    """What was asked for; only Parquet can be written."""
+    pictures: bool
+    """Whether pictures were asked for; none can be drawn."""
+    points: bool | None
+    """Whether the points were asked for; None where nothing was said, as Parquet holds none."""
+    mounted: bool
+    """Whether the sensor is to be seen level, or elsewhere; sweeps are taken as they are."""
+    address: str | None
+    """Of the cluster; None to start one here."""
+    jobs: int | None
+    """Workers; None for as many as there are cores."""
+    topic: str | None
+    """Topic of the points in recordings."""
+    capacity: int | None
+    """Points a sweep is padded to, or None for what it needs."""
+    min_score: float
+    """Boxes with lower scores are dropped."""
+    resume: bool
+    """Whether finished partitions are kept."""
+    quiet: bool
+    """Whether only errors are printed."""
+    json: bool
+    """Whether stdout is JSON Lines."""
+
+    @property
+    def speaks(self) -> bool:
+        """Whether sentences are printed."""
+        return not (self.quiet or self.json)
+
+    def check(self) -> None:
+        """Refuses what the workers cannot do.
+
+        Raises:
+          InputError: naming the option.
+        """
+        if self.mounted:
+            raise InputError(
+                "--level and --sensor-at: --engine ray takes sweeps as they are; leave these out."
+            )
+        if other := self.formats - {_PARQUET}:
+            raise InputError(
+                f"--format {min(other)}: the workers of --engine ray write parquet; leave it out."
+            )
+        if self.pictures:
+            raise InputError("--pictures: the workers of --engine ray draw none; leave the option out.")
+        if self.points is not None:
+            raise InputError(
+                "--points and --no-points: the parquet of --engine ray holds no points; leave the option out."
+            )
+
+    def common(self) -> dict[str, Any]:
+        """Options that the functions of `jaxbox.cluster` have in common, by name."""
+        return {
+            "address": self.address,
+            "workers": self.jobs,
+            "capacity": self.capacity,
+            "min_score": self.min_score,
+            "topic": self.topic,
+            "resume": self.resume,
+        }
+
+
+def check_local(output: str, address: str | None) -> None:
+    """Refuses what is for this engine alone where it was not asked for.
+
+    Raises:
+      InputError: naming the option.
+    """
+    if address is not None:
+        raise InputError("--address: only --engine ray has one; add it, or leave the address out.")
+    if "://" in output:
+        raise InputError(f"--output {output}: only --engine ray writes to a URL; add it, or give a folder.")
+
+
+def run_on_ray(options: RayOptions, start: Callable[[OnReport], DatasetReport[Any]]) -> ExitCode:
+    """Runs over an archive, and says how it goes.
+
+    Args:
+      options: the command's options.
+      start: does it.
+
+    Returns:
+      `ExitCode.FRAME_FAILED` where a sweep failed, it was interrupted, or Ray gave up.
+
+    Raises:
+      InputError: where there are no sweeps, or the options cannot be used.
+      ImportError: without the extra ``ray``.
+    """
+    options.check()
+    try:
+        with stoppable(), make_progress(shown=options.speaks) as progress:
+            report = start(_teller(options, progress))
+    except ClusterError as error:
+        print_error(f"{error} The partitions that are done stay; the same command with --resume goes on.")
+        return ExitCode.FRAME_FAILED
+    _tell_end(report, options)
+    return ExitCode.FRAME_FAILED if report.failures or report.interrupted else ExitCode.OK
+
+
+def _teller(options: RayOptions, progress: Progress) -> OnReport:
+    task = progress.add_task("partitions", total=None)
+
+    def on_report(part: PartitionReport, total: int) -> None:
+        progress.update(task, total=total, advance=1)
+        _tell(part, options)
+
+    return on_report
+
+
+def _tell(part: PartitionReport, options: RayOptions) -> None:
+    """One partition: what went wrong to stderr, and what was done to stdout."""
+    if part.num_deaths:
+        workers = "a worker" if part.num_deaths == 1 else f"{part.num_deaths} workers"
+        print_error(f"{part.name}: {workers} died on it; it was begun again.")
+    for failure in part.failures:
+        print_error(f"sweep {failure['sweep']}: {failure['reason']}")
+    if part.error is not None:
+        print_error(f"{part.name}: {part.error}")
+    if options.json:
+        stdout().out(json.dumps(dataclasses.asdict(part), allow_nan=False), highlight=False)
+    elif options.speaks:
+        failed = f", {len(part.failures)} failed" if part.failures else ""
+        stdout().print(
+            f"{part.name}: {part.num_done} of {part.num_sweeps} sweeps{failed}, {_found(part)}, "
+            f"{part.seconds:.1f} s",
+            markup=False,
+        )
+
+
+def _found(part: PartitionReport) -> str:
+    if isinstance(part, DriveReport):
+        return f"{part.num_tracks} tracks, poses: {part.pose_source or 'none'}"
+    return f"{part.num_boxes} boxes"
+
+
+def _tell_end(report: DatasetReport[Any], options: RayOptions) -> None:
+    if report.interrupted:
+        stderr().print("interrupted; the same command with --resume goes on.", markup=False)
+    if options.json:
+        summary = {
+            "done": report.num_done,
+            "skipped": report.num_skipped,
+            "interrupted": report.interrupted,
+            "failures": [{"sweep": item["sweep"], "reason": item["reason"]} for item in report.failures],
+            "repeated": [{"partition": name, "deaths": deaths} for name, deaths in report.deaths.items()],
+        }
+        stdout().out(json.dumps({"summary": summary}, allow_nan=False), highlight=False)
+    elif options.speaks:
+        num_done = report.num_done - report.num_done_before
+        rate = num_done / max(report.elapsed_s, 1e-9)
+        before = f", {report.num_done_before} done before" if report.num_skipped else ""
+        stdout().print(
+            f"{num_done} sweeps done, {len(report.failures)} failed{before}\n"
+            f"{report.num_boxes} boxes in {len(report.partitions)} partitions by {report.workers} workers, "
+            f"{report.elapsed_s:.1f} s in all with starting and compiling, {rate:.1f} sweeps a second",
+            markup=False,
+        )
