@@ -44,7 +44,7 @@ RECORD = {
     "timestamp_ns": TIME_NS,
     "boxes": [
         {"label": "car", "score": 0.5, "center": [9.0, 1.0, -1.0], "size": [4.0, 1.7, 1.5], "yaw": 0.1,
-         "num_points": 99},
+         "heading": 0.1, "front_probability": 0.7, "num_points": 99},
     ],
     "status": [],
     "counts": {"points": 12},

@@ -106,7 +106,7 @@ def test_mcap_boxes_are_cubes_where_the_detector_put_them_and_points_are_read_ba
         assert [cube.pose.position.x, cube.pose.position.y, cube.pose.position.z] == box["center"]
         assert [cube.size.x, cube.size.y, cube.size.z] == box["size"]
         turn = cube.pose.orientation
-        assert 2 * np.arctan2(turn.z, turn.w) == pytest.approx(box["yaw"])
+        assert 2 * np.arctan2(turn.z, turn.w) == pytest.approx(box["heading"])
     again = io.open_sweeps(output / "detections.mcap")
     np.testing.assert_array_equal(again[0].read_points()[0], io.read_points(sweeps / "a.bin")[0])
 

@@ -87,7 +87,7 @@ def calls(path):
             yield ast.unparse(node.func), keywords, node.lineno
 
 
-BETWEEN_PROCESSES = {"run/processes.py", "cluster/dataset.py", "cluster/worker.py"}
+BETWEEN_PROCESSES = {"run/processes.py", "cluster/run.py", "cluster/worker.py"}
 """Here pickle carries items to processes that jaxbox started itself, and nothing from a file."""
 
 

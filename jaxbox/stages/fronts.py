@@ -104,6 +104,6 @@ def front_log_odds(tops: jax.Array, profile: jax.Array) -> jax.Array:
 
 def _profiles(label: jax.Array) -> jax.Array:
     """(K, parts) float32: the usual tops of the class of each label, from rear to front."""
-    is_of = label[:, None] == jnp.arange(len(Label))[None]
+    is_of = label[:, None] == jnp.arange(len(Label), dtype=label.dtype)[None]
     profiles = jnp.array([one.front_profile for one in Label], jnp.float32)
     return jnp.sum(jnp.where(is_of[..., None], profiles[None], 0), axis=1)
