@@ -33,6 +33,10 @@ def test_a_box_turned_back_has_the_corners_of_the_recorded_sweep(copy, detection
     turned = corners(detections.center, size, np.asarray(detections.yaw, np.float64))
     back = turn_back(detections, copy)
     assert bool(jnp.all((back.yaw >= -np.pi / 2) & (back.yaw < np.pi / 2)))
+    np.testing.assert_allclose(np.abs(np.sin(back.heading - back.yaw)), 0, atol=1e-5)
+    ahead = np.stack([np.cos(back.heading), np.sin(back.heading), 0 * back.heading], axis=-1)
+    expected = np.stack([np.cos(detections.heading), np.sin(detections.heading)], axis=-1)
+    np.testing.assert_allclose(turn_points(ahead, copy)[:count, :2], expected[:count], atol=1e-5)
     found = corners(back.center, size, np.asarray(back.yaw, np.float64))
     for k in range(count):
         again = turn_points(np.c_[found[k], np.zeros(4)], copy)[:, :2]

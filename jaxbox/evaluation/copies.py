@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation.matching import count_points_in_boxes
-from jaxbox.geometry.planar import wrap_yaw
+from jaxbox.geometry.planar import wrap_turn, wrap_yaw
 from jaxbox.io import KittiObject, Sweep, boxes_from_objects, objects_from_detections
 from jaxbox.run.compiled import detect
 from jaxbox.types import Calibration, Detections, PointCloud, Status
@@ -101,16 +101,21 @@ def turn_back(detections: Detections, copy: Copy) -> Detections:
       copy: how they were turned.
 
     Returns:
-      The detections with another centre and yaw.
+      The detections with another centre, yaw and heading.
     """
     center = np.asarray(detections.center, np.float64) @ _rotation(copy.turn_deg)
-    yaw = np.asarray(detections.yaw, np.float64) - np.radians(copy.turn_deg)
     if copy.mirrored:
-        center, yaw = center * [1, -1, 1], -yaw
+        center = center * [1, -1, 1]
+
+    def back(angle: jax.Array) -> jax.Array:
+        turned = np.asarray(angle, np.float64) - np.radians(copy.turn_deg)
+        return jnp.asarray(-turned if copy.mirrored else turned, jnp.float32)
+
     return dataclasses.replace(
         detections,
         center=jnp.asarray(center, jnp.float32),
-        yaw=wrap_yaw(jnp.asarray(yaw, jnp.float32)),
+        yaw=wrap_yaw(back(detections.yaw)),
+        heading=wrap_turn(back(detections.heading)),
     )
 
 
