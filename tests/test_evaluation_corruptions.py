@@ -56,7 +56,7 @@ def test_each_severity_leaves_fewer_points(name, sweep):
     assert all(after < before for before, after in itertools.pairwise(counts))
 
 
-@pytest.mark.parametrize("name", ["noise", "clutter", "speed", "turning"])
+@pytest.mark.parametrize("name", ["noise", "clutter", "reflections", "speed", "turning"])
 def test_each_severity_moves_points_farther(name, sweep):
     moved = [
         np.linalg.norm(corrupted(name, sweep, a)[0] - sweep.xyz, axis=1).mean()
@@ -159,3 +159,16 @@ def test_a_corrupted_calibration_is_rigid_and_off_by_the_amount(name):
         shift = np.linalg.norm(error[:3, 3])
         assert (angle if kind.unit == "degrees" else shift) == pytest.approx(amount, rel=1e-2)
         assert (shift if kind.unit == "degrees" else angle) == pytest.approx(0, abs=0.03)
+
+
+def test_reflections_lie_below_the_road_on_their_beams(sweep):
+    share = 0.01
+    xyz, _ = corrupted("reflections", sweep, share)
+    moved = np.flatnonzero((xyz != sweep.xyz).any(axis=1))
+    assert len(moved) == round(share * len(sweep.xyz))
+    before, after = sweep.xyz[moved].astype(float), xyz[moved].astype(float)
+    cosine = (before * after).sum(axis=1) / ranges(before) / ranges(after)
+    np.testing.assert_allclose(cosine, 1, atol=1e-6)
+    depth = before[:, 2] - after[:, 2]
+    low, high = corruptions.REFLECTION_DEPTHS_M
+    assert ((depth > low - 1e-5) & (depth < high + 1e-5)).all()

@@ -113,6 +113,11 @@ class GroundConfig:
     """Points nearer than this are the carrier vehicle, not ground."""
     envelope_margin_m: Scalar = 0.1
     """A cell minimum within this of the lower envelope is ground."""
+    min_support_share: Scalar = 0.05
+    """Ground has, within 3 m, at least this share of the points up to 1.2 m above it at about its height
+    (.1 to .2 m); what lies below is a reflection. 0 asks for none."""
+    min_support_points: Scalar = 2.0
+    """And at least so many points."""
     smoothing_m: Scalar = 1.0
     """Standard deviation of the Gaussian that smooths the ground grid (and fills it, 4 x wider)."""
     min_height_m: Scalar = 0.2

@@ -30,6 +30,12 @@ BACKSCATTER_SHARE = 0.3
 MIN_RANGE_M = 2.0
 """No spurious return is nearer: an HDL-64E reports none nearer than 0.9 m, and the carrier is excluded."""
 
+ROAD_BELOW_M = 1.3
+"""What lies lower than this below the sensor is taken for road, for sensors at about 1.7 m."""
+
+REFLECTION_DEPTHS_M = (0.2, 0.8)
+"""How far below the road beams seem to end that it reflects."""
+
 SWEEP_PERIOD_S = 0.1
 """Of one turn."""
 
@@ -140,6 +146,27 @@ def add_clutter(xyz: np.ndarray, intensity: np.ndarray, share: float, rng: np.ra
     near = MIN_RANGE_M + rng.random(len(xyz)) * (distance - MIN_RANGE_M)
     scale = np.where(spurious, near / np.maximum(distance, MIN_RANGE_M), 1)
     return (xyz * scale[:, None]).astype(np.float32), np.where(spurious, 0, intensity).astype(np.float32)
+
+
+def reflect_below_road(
+    xyz: np.ndarray, intensity: np.ndarray, share: float, rng: np.random.Generator
+) -> Points:
+    """Lets some beams that meet the road end farther on, below it, as puddles and wet asphalt do.
+
+    Args:
+      xyz: (n, 3) m.
+      intensity: (n,).
+      share: of all points, 0 (none) to 1; no more than lie lower than `ROAD_BELOW_M`.
+      rng: draws which, and how far below the road, uniform in `REFLECTION_DEPTHS_M`.
+
+    Returns:
+      As many points.
+    """
+    on_road = np.flatnonzero(xyz[:, 2] < -ROAD_BELOW_M)
+    rows = rng.permutation(on_road)[: round(share * len(xyz))]
+    z, moved = xyz[rows, 2], xyz.astype(np.float32)
+    moved[rows] *= ((z - rng.uniform(*REFLECTION_DEPTHS_M, len(rows))) / z)[:, None].astype(np.float32)
+    return moved, intensity
 
 
 def drive_during_sweep(
@@ -271,6 +298,13 @@ CORRUPTIONS: dict[str, Corruption] = {
         none=0,
         amounts=(0.01, 0.02, 0.05, 0.1, 0.2),
         of_points=add_clutter,
+    ),
+    "reflections": Corruption(
+        title="returns from below the road",
+        unit="share of points",
+        none=0,
+        amounts=(0.001, 0.002, 0.005, 0.01, 0.02),
+        of_points=reflect_below_road,
     ),
     "speed": Corruption(
         title="driving during the sweep",

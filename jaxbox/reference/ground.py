@@ -22,6 +22,14 @@ WIDE_POOL_CELLS = 8
 """The wide Gaussian works on squares of that many cells."""
 TRUNCATE = 3.0
 """The Gaussians end at this many standard deviations."""
+SUPPORT_SQUARE_M = 2.0
+"""Points support each other as ground in squares of this edge, and the eight round them."""
+SUPPORT_LEVELS_PER_M = 10.0
+"""Heights are compared in levels of .1 m."""
+SUPPORT_LEVELS = 12
+"""Two levels are held against so many from the lower of them up."""
+SENSOR_LEVELS, PLANE_LEVELS = range(-100, 28), range(-13, 11)
+"""Levels about the sensor, and about the plane."""
 MIN_PLANE_POINTS = 3
 """A plane has three degrees of freedom."""
 
@@ -98,6 +106,7 @@ def cell_minima(xyz: np.ndarray, config: GroundConfig) -> np.ndarray:
     """
     half, cell_m = np.array([config.candidate_half_x_m, config.candidate_half_y_m]), GROUND_CANDIDATE_CELL_M
     xyz = xyz[(np.abs(xyz[:, :2]) < half).all(axis=1)].astype(np.float64)
+    xyz = xyz[xyz[:, 2] >= least_supported(xyz[:, 2], xyz[:, :2], half, SENSOR_LEVELS, config)]
     index = np.floor((xyz[:, :2] + half) / cell_m).astype(int)
     shape = np.ceil(2 * half / cell_m).astype(int) + 1
     lowest = np.full(shape, np.inf)
@@ -105,6 +114,41 @@ def cell_minima(xyz: np.ndarray, config: GroundConfig) -> np.ndarray:
     row, column = np.nonzero(np.isfinite(lowest))
     center = (np.column_stack([row, column]) + 0.5) * cell_m - half
     return np.column_stack([center, lowest[row, column]])
+
+
+def least_supported(
+    z: np.ndarray, xy: np.ndarray, halves_m: np.ndarray, levels: range, config: GroundConfig
+) -> np.ndarray:
+    """How low a point may be to be ground: where others near by are about as low.
+
+    Args:
+      z: (n,) m.
+      xy: (n, 2) m.
+      halves_m: (2,) m: the squares cover |x| and |y| below these.
+      levels: which levels of .1 m there are; lower and higher points are in the first and the last.
+      config: the least share, and the least number, of the points in 3 x 3 squares.
+
+    Returns:
+      (n,) m: minus infinity where the lowest level has support, infinity where none has.
+    """
+    rows, columns = np.ceil(2 * halves_m / SUPPORT_SQUARE_M).astype(int)
+    square = np.floor((xy + halves_m) / SUPPORT_SQUARE_M).astype(int).clip(0, (rows - 1, columns - 1))
+    level = np.floor(z * SUPPORT_LEVELS_PER_M).astype(int).clip(levels.start, levels.stop - 1) - levels.start
+    count = np.zeros((rows, columns, len(levels)))
+    np.add.at(count, (*square.T, level), 1)
+    count = ndimage.convolve(count, np.ones((3, 3, 1)), mode="constant")
+
+    def up_to(num: int) -> np.ndarray:
+        """In each level and the ones above it, so many in all."""
+        padded = np.pad(count, ((0, 0), (0, 0), (0, num - 1)))
+        return np.lib.stride_tricks.sliding_window_view(padded, num, axis=2).sum(axis=-1)
+
+    needed = np.maximum(config.min_support_share * up_to(SUPPORT_LEVELS), config.min_support_points)
+    supported = up_to(2) >= needed
+    least = np.array(levels) / SUPPORT_LEVELS_PER_M
+    least[0] = -np.inf
+    lowest = np.where(supported.any(axis=2), least[supported.argmax(axis=2)], np.inf)
+    return lowest[tuple(square.T)]
 
 
 def spread_points(xyz: np.ndarray, inlier: np.ndarray, config: GroundConfig) -> np.ndarray:
@@ -255,6 +299,8 @@ def fit_ground_surface(xyz: np.ndarray, planes: np.ndarray, config: GroundConfig
     ground = ((index >= 0) & (index < num_cells)).all(axis=1) & (rho > config.blind_radius_m)
     ground &= deviation > -(config.band_below_m + config.band_below_grade * rho)
     ground &= deviation < config.band_above_m + config.band_above_grade * rho
+    index, xy, deviation = index[ground], xyz[ground, :2], deviation[ground]
+    ground = deviation >= least_supported(deviation, xy, np.full(2, half_m), PLANE_LEVELS, config)
     lowest = np.full((num_cells, num_cells), np.inf)
     np.minimum.at(lowest, tuple(index[ground].T), deviation[ground])
     step = float(config.max_grade * cell_m)

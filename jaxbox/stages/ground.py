@@ -45,6 +45,18 @@ GAUSSIAN_TRUNCATION = 3.0
 """Gaussians reach that many standard deviations, as in scipy.ndimage.gaussian_filter(truncate=3)."""
 
 
+SUPPORT_SQUARE_M = 2.0
+"""Edge of the squares in which points support each other as ground."""
+
+
+SUPPORT_LEVELS_PER_M = 10.0
+"""Heights are compared in levels of .1 m."""
+
+
+SENSOR_LEVELS, PLANE_LEVELS = range(-100, 28), range(-13, 11)
+"""Levels about the sensor, in which the ground is sought, and about the plane."""
+
+
 def remove_ground(sweep: Sweep, config: GroundConfig, key: jax.Array) -> Ground:
     """Fits the ground, and measures every point's height above it.
 
@@ -147,6 +159,8 @@ def cell_minima(xyz: jax.Array, mask: jax.Array, config: GroundConfig) -> tuple[
     inside = mask & (jnp.abs(xyz[:, 0]) < half_x_m) & (jnp.abs(xyz[:, 1]) < half_y_m)
     i = jnp.floor((xyz[:, 0] + half_x_m) / GROUND_CANDIDATE_CELL_M).astype(jnp.int32)
     j = jnp.floor((xyz[:, 1] + half_y_m) / GROUND_CANDIDATE_CELL_M).astype(jnp.int32)
+    halves_m = half_x_m, half_y_m
+    inside &= xyz[:, 2] >= least_supported(xyz[:, 2], xyz[:, :2], inside, halves_m, SENSOR_LEVELS, config)
     lowest = segment_minima(xyz[:, 2], i * columns + j, inside, num_segments=rows * columns)
     occupied = jnp.isfinite(lowest)
     i, j = np.indices((rows, columns), np.float32).reshape(2, -1)
@@ -154,6 +168,67 @@ def cell_minima(xyz: jax.Array, mask: jax.Array, config: GroundConfig) -> tuple[
     y = (j + 0.5) * GROUND_CANDIDATE_CELL_M - half_y_m
     candidates = jnp.stack([x, y, jnp.where(occupied, lowest, 0)], axis=1)
     return candidates, occupied
+
+
+def least_supported(
+    z: jax.Array,
+    xy: jax.Array,
+    mask: jax.Array,
+    halves_m: tuple[float, float],
+    levels: range,
+    config: GroundConfig,
+) -> jax.Array:
+    """How low a point may be to be ground: where others near by are about as low.
+
+    Returns from below the road (a beam that a puddle or glass reflects goes on past the road) are few and
+    spread in height, the road's are many and close together. In each square with the eight round it, the
+    lowest level is sought that holds, together with the next, enough of the points up to 1.2 m above it.
+
+    Args:
+      z: (N,) float32, m.
+      xy: (N, 2) float32, m.
+      mask: (N,) bool, points that count.
+      halves_m: the squares cover |x| and |y| below these.
+      levels: which levels there are; lower and higher points are in the first and the last.
+      config: the least share of those points, and their least number.
+
+    Returns:
+      (N,) float32, m: minus infinity where the lowest level has support, infinity where none has.
+
+    Reference: oracle `jaxbox.reference.least_supported`.
+    """
+    num_levels = len(levels)
+    num_rows, num_columns = shape = [math.ceil(2 * half_m / SUPPORT_SQUARE_M) for half_m in halves_m]
+    level = jnp.floor(z * SUPPORT_LEVELS_PER_M).astype(jnp.int32) - levels.start
+    row, column = (
+        jnp.clip(jnp.floor((xy[:, a] + halves_m[a]) / SUPPORT_SQUARE_M).astype(jnp.int32), 0, shape[a] - 1)
+        for a in (0, 1)
+    )
+    place = (jnp.clip(level, 0, num_levels - 1) * num_rows + row) * num_columns + column
+    num_places = num_levels * num_rows * num_columns
+    count = jnp.zeros(num_places, jnp.int32).at[jnp.where(mask, place, num_places)].add(1, mode="drop")
+    count = _sum_of_neighbours(_sum_of_neighbours(count.reshape(num_levels, *shape), 1), 2)
+    about = count.astype(jnp.float32)
+    about = about + _from_level(about, 1)
+    four = about + _from_level(about, 2)
+    twelve = four + _from_level(four, 4) + _from_level(four, 8)
+    supported = about >= jnp.maximum(config.min_support_share * twelve, config.min_support_points)
+    least = np.array(levels, np.float32) / np.float32(SUPPORT_LEVELS_PER_M)
+    least[0] = -np.inf
+    least = jnp.min(jnp.where(supported, least[:, None, None], jnp.inf), axis=0)
+    return lookup(least, row, column)
+
+
+def _from_level(count: jax.Array, level: int) -> jax.Array:
+    """The counts of so many levels higher; none beyond the last."""
+    return jnp.pad(count[level:], ((0, level), (0, 0), (0, 0)))
+
+
+def _sum_of_neighbours(count: jax.Array, axis: int) -> jax.Array:
+    """Each with the ones before and after it along an axis."""
+    n = count.shape[axis]
+    padded = jnp.pad(count, [(1, 1) if a == axis else (0, 0) for a in range(count.ndim)])
+    return functools.reduce(jnp.add, (jax.lax.slice_in_dim(padded, k, k + n, axis=axis) for k in range(3)))
 
 
 def spread_points(
@@ -307,7 +382,10 @@ def fit_ground_surface(xyz: jax.Array, mask: jax.Array, planes: jax.Array, confi
     )
     i, j = (jnp.floor((xyz[:, axis] + half_m) / cell_m).astype(jnp.int32) for axis in (0, 1))
     inside = (i >= 0) & (i < n) & (j >= 0) & (j < n)
-    cell = jnp.where(mask & near_plane & inside & (rho > config.blind_radius_m), i * n + j, n * n)
+    may_be_ground = mask & near_plane & inside & (rho > config.blind_radius_m)
+    least = least_supported(height, xyz[:, :2], may_be_ground, (half_m, half_m), PLANE_LEVELS, config)
+    may_be_ground &= height >= least
+    cell = jnp.where(may_be_ground, i * n + j, n * n)
     lowest = jnp.full(n * n, jnp.inf, jnp.float32).at[cell].min(height, mode="drop").reshape(n, n)
     envelope = _lower_envelope(lowest, config.max_grade * cell_m, config.num_envelope_rounds)
     ground = jnp.isfinite(lowest) & (lowest < envelope + config.envelope_margin_m)
