@@ -200,6 +200,22 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[pathlib.Path]:
             os.close(handle)
 
 
+def check_no_link(folder: str | os.PathLike[str]) -> None:
+    """Refuses a link where a folder of the output is to be: what is written through it lies elsewhere.
+
+    Args:
+      folder: that files will be written to; it need not be there.
+
+    Raises:
+      InputError: where it is a link.
+    """
+    if pathlib.Path(folder).is_symlink():
+        raise InputError(
+            f"{folder}: a link, and pictures are not written through one; remove it, or name the folder that "
+            "it stands for as output."
+        )
+
+
 def remove_abandoned(folder: str | os.PathLike[str]) -> None:
     """Removes temporary files of `atomic_path` whose process was killed before it could do so itself.
 

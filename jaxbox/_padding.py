@@ -1,6 +1,7 @@
 """Sweeps of any length as arrays of a few fixed sizes, in NumPy."""
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -87,8 +88,8 @@ def checked_points(xyz: np.ndarray, intensity: np.ndarray | None) -> tuple[np.nd
     """Points as float32, and intensities, zeros where there are none.
 
     Args:
-      xyz: (n, 3) real numbers.
-      intensity: (n,) real numbers, or None.
+      xyz: (n, 3) real numbers; masked ones are NaN.
+      intensity: (n,) real numbers, or None; masked ones are 0.
 
     Returns:
       (n, 3) and (n,) float32; the arrays themselves where they are float32 already.
@@ -96,6 +97,7 @@ def checked_points(xyz: np.ndarray, intensity: np.ndarray | None) -> tuple[np.nd
     Raises:
       ValueError: for another shape or a non-numeric type.
     """
+    xyz, intensity = unmasked(xyz, np.nan), unmasked(intensity, 0)
     xyz = np.asarray(xyz)
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise ValueError(
@@ -112,6 +114,22 @@ def checked_points(xyz: np.ndarray, intensity: np.ndarray | None) -> tuple[np.nd
     # A float64 beyond float32's range becomes infinite here, and is counted as non-finite later.
     with np.errstate(over="ignore"):
         return xyz.astype(np.float32, copy=False), intensity.astype(np.float32, copy=False)
+
+
+def unmasked(values: Any, filler: float) -> Any:
+    """The values of an array that may have a mask, as `numpy.ma` makes them.
+
+    Args:
+      values: an array, or anything else, which stays as it is.
+      filler: number in the place of those that are masked.
+
+    Returns:
+      The values without a mask.
+    """
+    if not isinstance(values, np.ma.MaskedArray):
+        return values
+    is_real = values.dtype.kind in "fiu"
+    return np.where(np.ma.getmaskarray(values), filler, values.data) if is_real else values.data
 
 
 def _nearest(xyz: np.ndarray, count: int) -> np.ndarray:

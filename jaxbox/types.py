@@ -147,8 +147,8 @@ class PointCloud:
 
         Args:
           xyz: (n, 3) real numbers, m, sensor frame. NaN and infinity are allowed and are ignored,
-            and counted, by the detector.
-          intensity: (n,) real numbers, or None for zeros.
+            and counted, by the detector; so is a masked number, which is NaN.
+          intensity: (n,) real numbers, or None for zeros; a masked one is 0.
           capacity: N; by default the smallest of `CAPACITY_BUCKETS` that holds n points, or the
             largest bucket. Where n is larger than N the N nearest points are kept, in their order.
 

@@ -61,6 +61,30 @@ def test_the_same_numbers_give_the_same_cloud_however_they_are_stored(name):
     np.testing.assert_array_equal(found.xyz1, expected.xyz1)
 
 
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int32])
+def test_masked_points_are_ignored_and_counted_as_nan_is(kind):
+    xyz = np.ma.masked_array(np.arange(15).reshape(5, 3).astype(kind), mask=False)
+    xyz[1, 2] = xyz[3] = np.ma.masked
+    intensity = np.ma.masked_array(np.arange(5.0) + 7, mask=[1, 0, 0, 0, 0])
+    cloud = PointCloud.from_numpy(xyz, intensity, capacity=5)
+    assert np.isnan(cloud.xyz1[:, :3]).any(axis=1).tolist() == [False, True, False, True, False]
+    np.testing.assert_array_equal(cloud.xyz1[[0, 2, 4], :3], xyz.data[[0, 2, 4]])
+    assert cloud.intensity.tolist() == [0, 8, 9, 10, 11]
+    with pytest.raises(ValueError, match="must be real numbers"):
+        PointCloud.from_numpy(np.ma.masked_array(np.zeros((5, 3), bool)))
+
+
+def test_a_cloud_made_by_hand_counts_no_fewer_points_than_its_rows():
+    cloud = bad_input.pad(bad_input.STREET)[1]
+    found = answer(bad_input.STREET.name, "default")[1]
+    with pytest.raises(ValueError, match=r"num_points=-5; .*, 0 or above"):
+        detect(dataclasses.replace(cloud, num_points=np.array(-5, np.int32)))
+    # What lies on a device is not looked at before it is computed with.
+    lying = detect(dataclasses.replace(cloud, num_points=jax.numpy.int32(-5)))
+    assert lying.counts.num_points == found.counts.num_points == int(cloud.num_points)
+    assert int(lying.status) == int(found.status) == 0
+
+
 @pytest.mark.parametrize("name", bad_input.REFUSED)
 def test_bad_points_are_refused_saying_what_is_wrong_and_how_to_mend_it(name):
     arguments, options, message = bad_input.REFUSED[name]

@@ -163,6 +163,22 @@ def test_eval_draws_each_frame_and_one_contact_sheet(kitti_folder, detected, tmp
     assert tile.shape[0] > tile.shape[1] / 2, "the view from above alone: there is no image"
 
 
+def test_eval_does_not_draw_through_a_link_either(tmp_path, kitti_folder, detected):
+    output = tmp_path / "out"
+    output.mkdir()
+    for text in detected[0].glob("*.txt"):
+        (output / text.name).write_text(text.read_text())
+    for name, words in (("pictures", ["--pictures"]), ("plots", [])):
+        elsewhere = tmp_path / f"elsewhere_{name}"
+        elsewhere.mkdir()
+        (output / name).symlink_to(elsewhere)
+        result = run("eval", "--labels", kitti_folder, "--results", output, *words)
+        assert result.exit_code == 2, result.output
+        assert f"out/{name}: a link" in result.stderr
+        assert not list(elsewhere.iterdir())
+        (output / name).unlink()
+
+
 def test_eval_with_many_frames_writes_several_sheets(kitti_folder, detected, tmp_path, monkeypatch):
     monkeypatch.setattr(eval_pictures, "TILES_PER_SHEET", 1)
     read = read_folders(kitti_folder, detected[0])

@@ -28,7 +28,7 @@ def test_the_traced_settings_are_the_leaves_that_jit_sees(config):
 @pytest.mark.parametrize("config", PRESETS, ids=DetectorConfig.presets())
 def test_each_traced_setting_reaches_its_own_leaf_and_no_other(config):
     for position, name in enumerate(traced_fields(config)):
-        changed = replace_fields(config, {name: 123.25})
+        changed = replace_fields(config, {name: 0.625})
         differing = [
             i for i, pair in enumerate(zip(jax.tree.leaves(config), jax.tree.leaves(changed), strict=True))
             if pair[0] != pair[1]
@@ -66,6 +66,10 @@ def test_what_was_changed_is_what_changes_the_base_into_it():
         ("box.num_angles", 45.5, "must be a whole number"),
         ("clustering.max_obstacles", "many", "must be None or a whole number"),
         ("box.criterion", "best", "choose one of area, variance"),
+        ("region.half_x_m", -1, "must be a finite number above 0"),
+        ("vehicles.ring_weight", 10**400, "must be a finite number, 0 or above"),
+        ("box.num_angles", 10**30, "must be a whole number, 1 or above"),
+        ("vehicles.max_detections", 0, "must be a whole number, 1 or above"),
     ],
 )
 def test_a_change_that_cannot_be_made_is_refused_by_name(name, value, expected):
@@ -150,6 +154,26 @@ def test_a_file_that_cannot_be_taken_is_refused_with_its_name_and_the_setting(tm
     (tmp_path / "a.toml").write_text(text)
     with pytest.raises(io.InputError, match=rf"a\.toml: .*{expected}"):
         io.read_config(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.toml", ".".join(["a"] * 5000) + " = 1"),
+        ("a.toml", "[" + ".".join(["vehicles"] * 5000) + "]"),
+        ("a.toml", '["".' + '"".' * 5000 + '""]'),
+        ("a.toml", "vehicles.min_score = " + "[" * 5000 + "]" * 5000),
+        ("a.json", '{"vehicles":' * 5000 + "1" + "}" * 5000),
+        ("a.json", '{"vehicles.min_score":' + "[" * 900 + "]" * 900 + "}"),
+        ("a.json", '{"preset":' + "[" * 900 + "]" * 900 + "}"),
+        ("a.json", '{"sensor":' + "[" * 900 + "]" * 900 + "}"),
+    ],
+)
+def test_tables_within_tables_without_end_are_refused(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(io.InputError, match=name) as refused:
+        io.read_config(tmp_path / name)
+    assert len(str(refused.value)) < 500 + len(str(tmp_path))
 
 
 def test_json_settings_are_taken_and_named_so(tmp_path):

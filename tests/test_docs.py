@@ -61,8 +61,9 @@ def test_the_page_of_settings_has_every_setting_its_default_and_whether_it_is_tr
     names = {name: re.sub(r"\.\d+\.", ".N.", name) for name in fields.all_fields(config)}
     assert set(rows) == set(names.values())
     for name, value in fields.all_fields(config).items():
-        default, unit, kind, meaning = rows[names[name]]
+        default, takes, unit, kind, meaning = rows[names[name]]
         assert f"`{value}`" in default
+        assert (takes != "") == (not isinstance(value, bool | str)), name
         assert kind == ("traced" if name in traced else "static"), name
         assert (unit == "m") == name.endswith("_m")
         assert meaning

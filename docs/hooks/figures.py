@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jaxbox
+from jaxbox.config.ranges import range_of
 from jaxbox.evaluation.corruptions import CORRUPTIONS
 from jaxbox.tracking import TrackConfig, Tracks, TrackStatus, motion
 from jaxbox.types import Counts, Motion, Status
@@ -377,7 +378,7 @@ def track_settings() -> str:
     """Every setting of the tracker."""
     rows = [
         (name.replace("track.", ""), value, meaning)
-        for name, value, _, _, meaning in setting_rows(TrackConfig(), "track")
+        for name, value, *_, meaning in setting_rows(TrackConfig(), "track")
     ]
     return table(["setting", "default", "meaning"], rows)
 
@@ -581,7 +582,7 @@ def settings() -> str:
     return "\n\n".join(parts)
 
 
-SETTING_COLUMNS = ("setting", "default", "unit", "kind", "meaning")
+SETTING_COLUMNS = ("setting", "default", "range", "unit", "kind", "meaning")
 UNITS = {"_m": "m", "_deg": "degrees", "_grade": "m/m"}
 """By the last part of a name."""
 
@@ -615,8 +616,22 @@ def setting_rows(node: Any, prefix: str) -> list[tuple[str, ...]]:
         unit = next((unit for end, unit in UNITS.items() if field.name.endswith(end)), "")
         kind = "static" if field.metadata.get("static") else "traced"
         meaning = " ".join(texts[field.name].split()).removeprefix("static: ")
-        rows.append((f"`{name}`", f"`{value}`", unit, kind, meaning.replace("|", "\\|")))
+        rows.append((f"`{name}`", f"`{value}`", takes(name, field), unit, kind, meaning.replace("|", "\\|")))
     return rows
+
+
+def takes(name: str, field: dataclasses.Field[Any]) -> str:
+    """The numbers that a setting takes, by its dotted name; empty for other kinds of values."""
+    of_numbers = {"float": False, "int": True, "int | None": True, "Scalar": False}
+    kind = str(getattr(field.type, "__name__", field.type))
+    if kind not in of_numbers and "Array" not in kind:
+        return ""
+    found = range_of(
+        name.replace(".N.", "."),
+        is_static=bool(field.metadata.get("static")),
+        is_whole=of_numbers.get(kind, False),
+    )
+    return re.sub("a (finite|whole) number,? ?", "", found.text) or "any"
 
 
 TABLES: dict[str, Callable[[], str]] = {

@@ -7,6 +7,7 @@ import sys
 import threading
 import warnings
 from collections.abc import Iterator
+from typing import Any
 
 import typer
 from rich.console import Console
@@ -33,25 +34,51 @@ class ExitCode(enum.IntEnum):
     BAD_INPUT = 2
 
 
+def printable(text: str) -> str:
+    """Text of one line that does nothing to a terminal or a log, whatever name of a file is in it.
+
+    Args:
+      text: any.
+
+    Returns:
+      The text, with control characters, line breaks, marks that reorder text, and what is no text at all
+      written as Python escapes.
+
+    >>> printable("a\\x1b[31m b")
+    'a\\\\x1b[31m b'
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+class _Lines(Console):
+    """Prints each piece of text as one line, see `printable`."""
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """As rich's, with the text escaped."""
+        super().print(*(printable(o) if isinstance(o, str) else o for o in objects), **options)
+
+
 def stdout() -> Console:
     """Console for results. Made when asked, so that a redirected stdout is honoured."""
     width = None if sys.stdout.isatty() else FILE_WIDTH
-    return Console(highlight=False, soft_wrap=True, width=width)
+    return _Lines(highlight=False, soft_wrap=True, width=width)
 
 
 def stderr() -> Console:
     """Console for progress and errors."""
-    return Console(stderr=True, highlight=False, soft_wrap=True)
+    return _Lines(stderr=True, highlight=False, soft_wrap=True)
 
 
 def print_error(message: str) -> None:
     """Prints one line to stderr, as it stands: a path may hold what looks like markup."""
-    stderr().print(Text.assemble(("error: ", "bold red"), message))
+    stderr().print(Text.assemble(("error: ", "bold red"), printable(message)))
 
 
 def print_warning(message: str) -> None:
     """Prints one line to stderr, as `print_error`: something to know, after which all goes on."""
-    stderr().print(Text.assemble(("warning: ", "bold yellow"), message))
+    stderr().print(Text.assemble(("warning: ", "bold yellow"), printable(message)))
 
 
 @contextlib.contextmanager

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jaxbox import viz
+from jaxbox._files import check_no_link
 from jaxbox.cli.eval_pictures import write_judged_pictures
 from jaxbox.cli.report import make_table
 from jaxbox.evaluation import evaluate_folders
@@ -69,9 +70,12 @@ def run_eval(
             json.dump(report, handle, indent=1, allow_nan=False)
         console.print(f"wrote {json_path}", markup=False)
     if pictures:
+        check_no_link(results / PICTURES_FOLDER)
         read = read_folders(labels, results, missing_as_empty=missing_as_empty)
         for path in write_judged_pictures(read, results / PICTURES_FOLDER, min_score=min_score):
             console.print(f"wrote {path}", markup=False)
+    if plots is None:
+        check_no_link(results / PLOTS_FOLDER)
     objects = report["selections"][SIZE_SELECTION]["objects"]
     try:
         paths = write_plots(objects, plots or results / PLOTS_FOLDER)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jaxbox import io
+from jaxbox._files import check_no_link
 from jaxbox.cli.console import stdout
 from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
 from jaxbox.cli.report import SHOWN_MIN_SCORE
@@ -95,6 +96,7 @@ def prepare_run(
     if options.level and mounting is not None and options.speaks:
         where = f"see T_level_points in {RUN_NAME}"
         stdout().print(f"{describe_mounting(mounting)}, {where}", markup=False)
+    check_no_link(options.output / PICTURE_FOLDER)
     with written(options.output):
         options.output.mkdir(parents=True, exist_ok=True)
     for folder in (options.output, options.output / PICTURE_FOLDER):

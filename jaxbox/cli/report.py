@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from rich.table import Table
 
+from jaxbox.cli.console import printable
 from jaxbox.config import DEFAULT_SCORE_THRESHOLD
 from jaxbox.run.summary import classes_in_words
 from jaxbox.types import Detections, Status
@@ -142,5 +143,5 @@ def make_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]
     for index, column in enumerate(columns):
         table.add_column(column, justify="left" if index == 0 else "right")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(printable, row))
     return table

@@ -3,6 +3,7 @@
 from jaxbox.config.class_priors import ClassPrior, Label, Scalar
 from jaxbox.config.fitting import propose_capacities
 from jaxbox.config.presets import DetectorConfig
+from jaxbox.config.ranges import ConfigError
 from jaxbox.config.schema import (
     DEFAULT_SCORE_THRESHOLD,
     BoxConfig,
@@ -25,6 +26,7 @@ __all__ = [
     "ClusteringConfig",
     "CompletionConfig",
     "ComponentMap",
+    "ConfigError",
     "DetectorConfig",
     "EvidenceConfig",
     "FilterConfig",

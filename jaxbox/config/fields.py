@@ -11,15 +11,16 @@ import ast
 import dataclasses
 import difflib
 import json
-import math
 import tomllib
 import typing
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal, TypeVar
 
 import jax
+import numpy as np
 
 from jaxbox.config import DetectorConfig, TrackConfig
+from jaxbox.config.ranges import MAX_SHOWN, ConfigError, Range, checked_number, range_of, shown
 
 Config = TypeVar("Config", DetectorConfig, TrackConfig)
 """Settings of the detector or of the tracker."""
@@ -32,14 +33,25 @@ PRESET_KEY = "preset"
 """Key of a settings file that names the preset which the other keys change."""
 SENSOR_KEY = "sensor"
 """Key of a settings file that says for how many beams the preset is to be; see `jaxbox.config.sensors`."""
+MAX_DEPTH = 8
+"""Tables within tables of a settings file; no setting lies half as deep."""
 _TYPE_NAMES = {bool: "True or False", int: "a whole number", str: "a word", type(None): "None"}
 
 
 @dataclasses.dataclass(frozen=True)
 class _Leaf:
+    name: str
     value: Any
     static: bool
     hint: Any
+
+    @property
+    def allowed_types(self) -> set[type]:
+        return {part for part in (self.hint, *typing.get_args(self.hint)) if isinstance(part, type)}
+
+    @property
+    def range(self) -> Range:
+        return range_of(self.name, is_static=self.static, is_whole=float not in self.allowed_types)
 
 
 def traced_fields(config: DetectorConfig) -> dict[str, Any]:
@@ -72,6 +84,36 @@ def all_fields(config: DetectorConfig | TrackConfig) -> dict[str, Any]:
     return {name: leaf.value for name, leaf in _leaves(config)}
 
 
+def traced_ranges(config: DetectorConfig | TrackConfig) -> dict[str, Range]:
+    """The range of every traced setting.
+
+    Args:
+      config: the settings.
+
+    Returns:
+      By dotted name, in the order of `traced_fields`.
+
+    >>> traced_ranges(DetectorConfig())["vehicles.max_overlap"].text
+    'a finite number from 0 to 1'
+    """
+    return {name: leaf.range for name, leaf in _leaves(config) if not leaf.static}
+
+
+def check_static(config: DetectorConfig | TrackConfig) -> None:
+    """Refuses static settings of a wrong type or outside their range, as `replace_fields` does.
+
+    Args:
+      config: the settings, in which NumPy's numbers will do for Python's.
+
+    Raises:
+      ConfigError: naming the setting.
+    """
+    for name, leaf in _leaves(config):
+        if leaf.static:
+            value = leaf.value.item() if isinstance(leaf.value, np.generic) else leaf.value
+            _checked_value(name, leaf, value)
+
+
 def replace_fields(config: Config, changes: Mapping[str, Any]) -> Config:
     """Changes settings by their dotted names.
 
@@ -83,8 +125,8 @@ def replace_fields(config: Config, changes: Mapping[str, Any]) -> Config:
       The changed settings.
 
     Raises:
-      ValueError: naming the setting, where there is none of that name (with the nearest), or where it
-        cannot take the value.
+      ConfigError: naming the setting, where there is none of that name (with the nearest), or where it
+        cannot take the value; a `ValueError`.
 
     >>> replace_fields(DetectorConfig(), {"clustering.maps.1.cell_m": 0.3}).clustering.maps[1].cell_m
     0.3
@@ -92,7 +134,7 @@ def replace_fields(config: Config, changes: Mapping[str, Any]) -> Config:
     leaves = dict(_leaves(config))
     for name, value in changes.items():
         if name not in leaves:
-            raise ValueError(f"there is no setting {name}; nearest are {nearest_fields(name, leaves)}.")
+            raise ConfigError(f"there is no setting {name}; nearest are {nearest_fields(name, leaves)}.")
         config = _replaced(config, name.split("."), _checked_value(name, leaves[name], value))
     return config
 
@@ -165,7 +207,7 @@ def base_of(
     if sensor is None:
         return preset
     if isinstance(sensor, bool) or not isinstance(sensor, int):
-        raise ValueError(f"{SENSOR_KEY} is {sensor!r}; it must be a number of beams, such as 32.")
+        raise ConfigError(f"{SENSOR_KEY} is {shown(sensor)}; it must be a number of beams, such as 32.")
     return DetectorConfig.for_sensor(sensor, base=preset)
 
 
@@ -188,7 +230,8 @@ def preset_config(name: Any) -> DetectorConfig:
     """
     presets = DetectorConfig.presets()
     if not isinstance(name, str) or name not in presets:
-        raise ValueError(f"{name}: there is no such preset; choose one of {', '.join(presets)}.")
+        text = name if isinstance(name, str) else shown(name)
+        raise ConfigError(f"{text}: there is no such preset; choose one of {', '.join(presets)}.")
     return presets[name]
 
 
@@ -226,11 +269,13 @@ def _toml_value(leaf: _Leaf) -> str:
         return json.dumps(NO_VALUE)
     if isinstance(leaf.value, bool | str):
         return json.dumps(leaf.value)
-    return repr(float(leaf.value)) if float in _allowed_types(leaf) else repr(int(leaf.value))
+    return repr(float(leaf.value)) if float in leaf.allowed_types else repr(int(leaf.value))
 
 
-def _flatten(node: Any, name: str, values: dict[str, Any], lengths: dict[str, int]) -> None:
+def _flatten(node: Any, name: str, values: dict[str, Any], lengths: dict[str, int], depth: int = 0) -> None:
     """Splits nested tables into values by dotted name, and the lengths of lists of tables."""
+    if depth > MAX_DEPTH:
+        raise ConfigError(f"tables within tables, more than {MAX_DEPTH} deep, under {name[:MAX_SHOWN]}.")
     if isinstance(node, Mapping):
         parts = node.items()
     elif isinstance(node, list) and all(isinstance(part, Mapping) for part in node):
@@ -240,7 +285,7 @@ def _flatten(node: Any, name: str, values: dict[str, Any], lengths: dict[str, in
         values[name] = node
         return
     for key, part in parts:
-        _flatten(part, f"{name}.{key}" if name else str(key), values, lengths)
+        _flatten(part, f"{name}.{key}" if name else str(key), values, lengths, depth + 1)
 
 
 def _resized(config: DetectorConfig, name: str, length: int) -> DetectorConfig:
@@ -332,7 +377,8 @@ def parse_change(text: str) -> tuple[str, Any]:
         raise ValueError(f"{text}: write it as FIELD=VALUE.")
     try:
         return name.strip(), ast.literal_eval(value.strip())
-    except (ValueError, SyntaxError):
+    # The last two for brackets within brackets without end.
+    except (ValueError, SyntaxError, RecursionError, MemoryError):
         return name.strip(), value.strip()
 
 
@@ -379,13 +425,13 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, _Leaf]]:
     hints = typing.get_type_hints(type(node))
     for field in dataclasses.fields(node):
         value = getattr(node, field.name)
-        parts = enumerate(value) if isinstance(value, tuple) else [(None, value)]
+        parts = enumerate(value) if isinstance(value, tuple | list) else [(None, value)]
         for index, part in parts:
             name = f"{prefix}{field.name}" + ("" if index is None else f".{index}")
             if dataclasses.is_dataclass(part):
                 yield from _leaves(part, f"{name}.")
             else:
-                yield name, _Leaf(part, bool(field.metadata.get("static")), hints[field.name])
+                yield name, _Leaf(name, part, bool(field.metadata.get("static")), hints[field.name])
 
 
 def _checked_value(name: str, leaf: _Leaf, value: Any) -> Any:
@@ -395,29 +441,21 @@ def _checked_value(name: str, leaf: _Leaf, value: Any) -> Any:
     if typing.get_origin(leaf.hint) is Literal:
         choices = typing.get_args(leaf.hint)
         if value not in choices:
-            raise ValueError(f"{name} is {value!r}; choose one of {', '.join(map(str, choices))}.")
+            raise ConfigError(f"{name} is {shown(value)}; choose one of {', '.join(map(str, choices))}.")
         return value
-    allowed = _allowed_types(leaf)
-    if value == NO_VALUE and type(None) in allowed:
-        return None
-    # A bool is an int to Python, and an int will do for a float; nothing else is exchanged.
-    if float in allowed:
-        fits = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    else:
-        fits = type(value) in allowed
-    if not fits:
-        wanted = (
-            "a finite number"
-            if float in allowed
-            else " or ".join(sorted(_TYPE_NAMES.get(t, t.__name__) for t in allowed))
-        )
-        raise ValueError(f"{name} is {value!r}; it must be {wanted}.")
+    allowed = leaf.allowed_types
     # An int in the place of a threshold would be another type to the compiler, which then starts again.
-    return float(value) if float in allowed else value
-
-
-def _allowed_types(leaf: _Leaf) -> set[type]:
-    return {part for part in (leaf.hint, *typing.get_args(leaf.hint)) if isinstance(part, type)}
+    if float in allowed:
+        return checked_number(name, value, leaf.range)
+    if isinstance(value, str) and value == NO_VALUE and type(None) in allowed:
+        return None
+    # A bool is an int to Python; nothing is exchanged here.
+    if type(value) not in allowed:
+        wanted = " or ".join(sorted(_TYPE_NAMES.get(t, t.__name__) for t in allowed))
+        raise ConfigError(f"{name} is {shown(value)}; it must be {wanted}.")
+    if type(value) is int:
+        checked_number(name, value, leaf.range)
+    return value
 
 
 def _replaced(node: Any, path: list[str], value: Any) -> Any:

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from jaxbox._padding import unmasked
 from jaxbox.config.presets import DetectorConfig, rounded_up, with_max_cells
 from jaxbox.config.schema import ClusteringConfig, ComponentMap, GroundConfig
 
@@ -63,7 +64,7 @@ def _rough_counts(config: DetectorConfig, index: int, xyz: np.ndarray) -> list[i
     Raises:
       ValueError: for another shape.
     """
-    xyz = np.asarray(xyz)
+    xyz = np.asarray(unmasked(xyz, np.nan))
     if xyz.ndim != 2 or xyz.shape[1] != 3:
         raise ValueError(f"sweep {index} has shape {xyz.shape}; it must be (n, 3). Pass points[:, :3].")
     region = np.array([config.region.half_x_m, config.region.half_y_m])

@@ -152,6 +152,11 @@ def _operands(
 ) -> tuple[PointCloud, PackedConfig, jax.Array]:
     config = DetectorConfig() if config is None else config
     check_config(config)
+    if isinstance(cloud.num_points, np.ndarray | np.generic | int) and np.any(cloud.num_points < 0):
+        raise ValueError(
+            f"jaxbox.detect was given a cloud with num_points={cloud.num_points}; it is the number of points "
+            "in the sweep, 0 or above. PointCloud.from_numpy counts them."
+        )
     packed = PackedConfig.pack(config, accelerator=on_accelerator(cloud.xyz1))
     known, device = packed.thresholds, default_device()
     if isinstance(known, np.ndarray) and is_on_device(cloud.xyz1) and device in cloud.xyz1.devices():

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 
 from jaxbox.config import DetectorConfig, TrackConfig
+from jaxbox.config.checks import check_ranges
 from jaxbox.geometry.rigid import relative_rigid
 from jaxbox.run.carrier import Carrier, Clock, make_carrier, prepared, without_points
 from jaxbox.run.streaming import ReadableSweep, StreamedSweep, stream
@@ -97,6 +98,7 @@ def track(
     carrier = make_carrier(poses)
     clock = Clock(rate_hz, poses.times_ns if isinstance(poses, Poses) else None)
     track_config = TrackConfig() if track_config is None else track_config
+    check_ranges(track_config)
     tracker = _Tracker(track_config, carrier.source, max_tracks)
     begun: collections.deque[ReadableSweep] = collections.deque()
     streamed = stream(

@@ -175,7 +175,8 @@ def _counts(points: jax.Array, cloud: PointCloud, found: Found, largest_hull: ja
     obstacles, clusters = found.obstacles, found.clusters
     num_obstacles = jnp.minimum(obstacles.count, obstacles.row.shape[0])
     return Counts(
-        dropped_points=cloud.num_points - is_point,
+        # Of a cloud that was made by hand, and says that it has fewer points than rows, none were dropped.
+        dropped_points=jnp.maximum(cloud.num_points - is_point, 0),
         nonfinite_points=is_point - finite,
         out_of_range_points=finite - in_region,
         outlier_points=in_region - inliers,
@@ -197,9 +198,9 @@ def _counts(points: jax.Array, cloud: PointCloud, found: Found, largest_hull: ja
 
 
 def _status(cloud: PointCloud, counts: Counts, ground: Ground, config: DetectorConfig) -> jax.Array:
-    not_in_region = counts.dropped_points + counts.nonfinite_points + counts.out_of_range_points
+    in_region = counts.outlier_points + counts.ground_points + counts.overhead_points + counts.obstacles
     bits = {
-        Status.EMPTY: cloud.num_points == not_in_region,
+        Status.EMPTY: in_region == 0,
         Status.NONFINITE_POINTS: counts.nonfinite_points > 0,
         Status.POINT_OVERFLOW: counts.dropped_points > 0,
         Status.NO_GROUND: ~ground.plane.found,
