@@ -3,7 +3,6 @@
 All on the host, from what `detect` returns anyway; `jaxbox.summarise` is the way in.
 """
 
-import collections
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -93,26 +92,6 @@ class GroundSummary:
             inliers=inliers,
             inlier_share=inliers / _num_candidates(config),
         )
-
-
-def classes_in_words(labels: np.ndarray) -> str:
-    """How many of each class there are.
-
-    Args:
-      labels: (k,) int, of `Label`.
-
-    Returns:
-      Words; empty for none.
-
-    >>> classes_in_words(np.array([0, 1, 0, 0]))
-    '3 cars, 1 van'
-    """
-    counts = collections.Counter(Label(label) for label in labels.tolist())
-    return ", ".join(
-        f"{counts[label]} {label.plural if counts[label] > 1 else label.word}"
-        for label in Label
-        if counts[label]
-    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
