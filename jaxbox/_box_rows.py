@@ -144,7 +144,7 @@ class BoxRows(ByValue, Generic[AnyBox]):
         """For notebooks: the text, and the boxes from above."""
         if isinstance(self.valid, jax.core.Tracer) or np.ndim(self.valid) != 1:
             return None
-        return from_above("viz.html").picture_with_text(repr(self), self.draw())
+        return later_module("viz.html").picture_with_text(repr(self), self.draw())
 
     def draw(self, xyz: np.ndarray | None = None, *, frame: Any = None, title: str = "") -> np.ndarray:
         """Draws the boxes from above.
@@ -193,7 +193,7 @@ class BoxRows(ByValue, Generic[AnyBox]):
 
     def to_nuscenes(self, *, T_global_sensor: np.ndarray | None = None, sample_token: str = "") -> list[dict]:
         """The boxes as nuScenes' results, see `jaxbox.io.nuscenes.boxes_to_nuscenes`."""
-        return from_above("io.nuscenes").boxes_to_nuscenes(
+        return later_module("io.nuscenes").boxes_to_nuscenes(
             self, T_global_sensor=T_global_sensor, sample_token=sample_token
         )
 
@@ -208,7 +208,7 @@ class BoxRows(ByValue, Generic[AnyBox]):
         ]
 
 
-def from_above(module: str) -> Any:
+def later_module(module: str) -> Any:
     """A module of a later layer, imported when a person asks for a picture or the form of a file.
 
     What people call at the prompt reaches up, as the ``plot`` of a table does. What is compiled must not.

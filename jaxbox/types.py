@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbox._box import Detection
-from jaxbox._box_rows import BoxRows, from_above
+from jaxbox._box_rows import BoxRows, later_module
 from jaxbox._padding import aligned_empty, checked_points, fill_rows, fitting_capacity
 from jaxbox.config import DetectorConfig
 from jaxbox.config import Label as Label  # noqa: PLC0414 - one of the types that users hold
@@ -417,16 +417,16 @@ class Detections(BoxRows[Detection]):
     def to_kitti(self, calibration: "Calibration", *, min_visible_fraction: float | None = None) -> list[Any]:
         """The boxes that a camera sees as KITTI's objects, see `jaxbox.io.objects_from_detections`."""
         options = {} if min_visible_fraction is None else {"min_visible_fraction": min_visible_fraction}
-        return from_above("io.kitti").objects_from_detections(self[:], calibration, **options)
+        return later_module("io.kitti").objects_from_detections(self[:], calibration, **options)
 
     def draw(self, xyz: np.ndarray | None = None, *, frame: Any = None, title: str = "") -> np.ndarray:
         """Draws the boxes from above, see `jaxbox.viz.draw_detections`."""
-        return from_above("viz.answer").draw_detections(self, xyz, frame=frame, title=title)
+        return later_module("viz.answer").draw_detections(self, xyz, frame=frame, title=title)
 
     def raise_if_failed(self) -> None:
         """Raises where anything was dropped for want of capacity, naming the field to enlarge.
 
-        It takes the answer of one sweep: of a batch, take one row by `jax.tree.map` first.
+        It takes the answer of one sweep: of a batch, take one from `unstack` first.
 
         Raises:
           RuntimeError: one line a failure, with the configuration field and the size needed.

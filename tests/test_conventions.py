@@ -97,7 +97,7 @@ def test_imports_go_down_the_layers_only(path):
 def test_only_what_people_call_on_boxes_imports_by_name_and_so_past_the_layers():
     importing = [path for path in source_files() if 'import_module(f"jaxbox' in path.read_text()]
     assert [relative(path) for path in importing] == ["_box_rows.py"]
-    calls = {relative(path) for path in source_files() if "from_above(" in path.read_text()}
+    calls = {relative(path) for path in source_files() if "later_module(" in path.read_text()}
     assert calls == {"_box_rows.py", "types.py", "tracking/tracks.py"}
 
 

@@ -1,6 +1,8 @@
 """Laws of detections and tracks in people's hands: length, boxes, choices, tables, pictures, conversions."""
 
 import dataclasses
+import pathlib
+import re
 import sys
 import types
 
@@ -260,18 +262,9 @@ def test_tracks_are_held_alike(tracks):
     assert tracks.draw().shape == (*viz.BirdEyeFrame().shape, 3)
     assert "data:image/png" in tracks._repr_html_()
     columns = tracks.to_columns()
-    absent = {
-        "sequence",
-        "frame",
-        "time_s",
-        "sweep",
-        "timestamp_ns",
-        "num_points",
-        "world_x",
-        "world_y",
-        "world_z",
-    }
-    assert set(columns) == set(io.parquet.TRACK_COLUMNS) - absent
+    of_the_drive = {"sequence", "frame", "time_s", "sweep", "timestamp_ns", "num_points"}
+    in_the_world = {"world_x", "world_y", "world_z"}
+    assert set(columns) == set(io.parquet.TRACK_COLUMNS) - of_the_drive - in_the_world
     assert tracks.to_pandas()["id"].tolist() == [track.id for track in tracks]
 
 
@@ -335,6 +328,20 @@ def test_what_is_not_installed_is_named(found, monkeypatch, method, library):
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(ImportError, match=rf"pip install 'jaxbox\[{library}\]'"):
         getattr(found, method)()
+
+
+def test_the_examples_of_the_tutorial_run(tmp_path, monkeypatch, capsys):
+    page = (pathlib.Path(__file__).parents[1] / "docs" / "tutorial.md").read_text()
+    page = page[: page.index("\n## Thresholds never recompile\n")]
+    # A sparser sweep, whose detector is compiled already.
+    small = page.replace("make_sweep(seed=0)", f"make_sweep(6, num_azimuths={NUM_AZIMUTHS})")
+    assert small != page
+    monkeypatch.chdir(tmp_path)
+    scope = {}
+    for example in re.findall(r"```python\n(.*?)```", small, re.DOTALL):
+        exec(compile(example, "tutorial.md", "exec"), scope)
+    assert (tmp_path / "boxes.png").stat().st_size > 10_000
+    assert capsys.readouterr().out.endswith("True\n"), "the cloud has the answer of its array"
 
 
 def test_detections_are_still_a_tree_of_the_same_leaves(found):

@@ -13,6 +13,7 @@ import numpy as np
 from jaxbox.config import DEFAULT_SCORE_THRESHOLD, DetectorConfig
 from jaxbox.config.capacities import CAPACITIES, CLOUD_CAPACITY
 from jaxbox.config.schema import GROUND_CANDIDATE_CELL_M
+from jaxbox.run.arguments import as_config
 from jaxbox.types import NUM_POINT_COUNTS, Counts, Detections, GroundPlane, Label, Status
 
 POINT_PLACES = tuple(field.name for field in dataclasses.fields(Counts)[:NUM_POINT_COUNTS])
@@ -150,7 +151,7 @@ class Summary:
 
 def summarise(
     detections: Detections,
-    config: DetectorConfig | None = None,
+    config: DetectorConfig | str | None = None,
     *,
     min_score: float = DEFAULT_SCORE_THRESHOLD,
 ) -> Summary:
@@ -159,14 +160,15 @@ def summarise(
     It waits for the answer and works on the host.
 
     Args:
-      detections: of one sweep: of a batch, take one row by `jax.tree.map` first.
-      config: the settings that `detect` had, which say how large each capacity is; None for the default.
+      detections: of one sweep: of a batch, take one from `Detections.unstack`.
+      config: the settings that `detect` had, or the name of a preset, which say how large each capacity is;
+        None for the default.
       min_score: boxes with lower scores are not listed.
 
     Returns:
       The summary; its `to_dict` is for JSON.
     """
-    config = DetectorConfig() if config is None else config
+    config = as_config(config)
     counts, score = detections.counts, np.asarray(detections.score)
     keep = np.asarray(detections.valid) & (score >= min_score)
     label, center, size = (

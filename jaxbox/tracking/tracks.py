@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbox._box import Box
-from jaxbox._box_rows import BoxRows, from_above
+from jaxbox._box_rows import BoxRows, later_module
 from jaxbox.config.class_priors import Label, classes_in_words
 from jaxbox.types import Calibration, Motion, to_host
 
@@ -269,7 +269,7 @@ class Tracks(BoxRows[Track]):
         self, calibration: Calibration, *, frame: int, min_visible_fraction: float | None = None
     ) -> list[Any]:
         """The tracks that a camera sees as KITTI's objects of a frame, see `jaxbox.io.write_tracks`."""
-        tracks, kitti = self[:], from_above("io.kitti_tracking")
+        tracks, kitti = self[:], later_module("io.kitti_tracking")
         options = {} if min_visible_fraction is None else {"min_visible_fraction": min_visible_fraction}
         return kitti.objects_from_tracks(
             np.column_stack([tracks.center, tracks.size, tracks.heading]),
@@ -284,6 +284,6 @@ class Tracks(BoxRows[Track]):
     def draw(self, xyz: np.ndarray | None = None, *, frame: Any = None, title: str = "") -> np.ndarray:
         """Draws the tracks from above, see `jaxbox.viz.draw_tracks`."""
         points = np.zeros((0, 3)) if xyz is None else np.asarray(xyz)[:, :3]
-        return from_above("viz.tracks").draw_tracks(
+        return later_module("viz.tracks").draw_tracks(
             points, self[:], frame=frame, title=title, confirmed=False
         )
