@@ -1,5 +1,6 @@
 """jaxbox: training-free LiDAR vehicle detection as one compiled JAX function."""
 
+from jaxbox._box import Box, Detection
 from jaxbox._version import __version__
 from jaxbox.config import DEFAULT_SCORE_THRESHOLD, DetectorConfig, TrackConfig, propose_capacities
 from jaxbox.run import serialization as _serialization  # noqa: F401 - jax.export learns the types below
@@ -9,7 +10,7 @@ from jaxbox.run.compiled import detect
 from jaxbox.run.streaming import StreamedSweep, stream
 from jaxbox.run.summary import Summary, summarise
 from jaxbox.run.tracking import TrackedSweep, track
-from jaxbox.tracking.tracks import Sight, Tracks, TrackStatus
+from jaxbox.tracking.tracks import Sight, Track, Tracks, TrackStatus
 from jaxbox.types import (
     Calibration,
     Detections,
@@ -24,7 +25,9 @@ from jaxbox.types import (
 
 __all__ = [
     "DEFAULT_SCORE_THRESHOLD",
+    "Box",
     "Calibration",
+    "Detection",
     "Detections",
     "DetectorConfig",
     "GroundPlane",
@@ -36,6 +39,7 @@ __all__ = [
     "Status",
     "StreamedSweep",
     "Summary",
+    "Track",
     "TrackConfig",
     "TrackStatus",
     "TrackedSweep",

@@ -15,16 +15,19 @@ import dataclasses
 import enum
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbox._box import Detection
+from jaxbox._box_rows import BoxRows, later_module
 from jaxbox._padding import aligned_empty, checked_points, fill_rows, fitting_capacity
 from jaxbox.config import DetectorConfig
 from jaxbox.config import Label as Label  # noqa: PLC0414 - one of the types that users hold
 from jaxbox.config.capacities import CAPACITIES, CLOUD_CAPACITY, Capacity
+from jaxbox.config.class_priors import classes_in_words
 
 GROUND_ABOVE_M = 0.5
 """A ground plane that passes so high over the origin lies above the sensor: where recordings are in their
@@ -312,9 +315,15 @@ class Counts:
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Detections:
-    """Vehicle boxes of one sweep, best score first, and the evidence for them."""
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Detections(BoxRows[Detection]):
+    """Vehicle boxes of one sweep, best score first, and the evidence for them.
+
+    Arrays of K rows, of which those of ``valid`` count, as a compiled function needs them. On the host it is
+    also a sequence of `Detection`: ``len(detections)``, ``detections[0]``, ``for box in detections``. Each
+    choice of boxes (``detections[1:]``, a mask, `above`, `of`, `within`) gives detections of those alone, in
+    NumPy arrays without padding; what is said of the whole sweep stays.
+    """
 
     center: jax.Array
     """(K, 3) float32, m, sensor frame: centre of the box."""
@@ -355,6 +364,11 @@ class Detections:
     counts: Counts
     """Where every point went."""
 
+    _of_sweep: ClassVar[frozenset[str]] = frozenset(
+        ("ground", "ground_mask", "point_component", "point_detection", "first_return_m", "status", "counts")
+    )
+    """Fields that have no row for each box."""
+
     def on_host(self) -> "Detections":
         """The same in NumPy arrays, once they are computed.
 
@@ -366,10 +380,53 @@ class Detections:
         """
         return to_host(self, self.status)
 
+    def _box_at(self, row: int) -> Detection:
+        """The box of a row, which is valid, of a sweep on the host."""
+        hull = np.asarray(self.hulls.vertices[row])
+        return Detection(
+            label=Label(self.label[row]),
+            score=float(self.score[row]),
+            center=np.asarray(self.center[row]),
+            size=np.asarray(self.size[row]),
+            yaw=float(self.yaw[row]),
+            heading=float(self.heading[row]),
+            front_probability=float(self.front_probability[row]),
+            num_points=int(self.num_points[row]),
+            hull=hull[: min(int(self.hulls.num_vertices[row]), len(hull))],
+            point_detection=np.asarray(self.point_detection),
+            row=row,
+        )
+
+    def _title(self) -> str:
+        """What there is, in a line, of a sweep on the host."""
+        words = classes_in_words(np.asarray(self.label)[self.valid]) or "no box"
+        return f"{words}; {self.counts.num_points} points; {Status(int(self.status)).name}"
+
+    def _with_rows(self, rows: np.ndarray) -> "Detections":
+        """Some rows (k,) int of a sweep on the host; points of other boxes belong to none."""
+        # The last place is that of -1, for points of no box.
+        places = np.full(len(self.valid) + 1, -1, np.int32)
+        places[rows] = np.arange(len(rows))
+        chosen = super()._with_rows(rows)
+        return dataclasses.replace(chosen, point_detection=places[self.point_detection])
+
+    def to_columns(self) -> dict[str, np.ndarray]:
+        """Columns as `jaxbox.io.parquet` has them, with ``num_points``."""
+        return super().to_columns() | {"num_points": np.asarray(self[:].num_points)}
+
+    def to_kitti(self, calibration: "Calibration", *, min_visible_fraction: float | None = None) -> list[Any]:
+        """The boxes that a camera sees as KITTI's objects, see `jaxbox.io.objects_from_detections`."""
+        options = {} if min_visible_fraction is None else {"min_visible_fraction": min_visible_fraction}
+        return later_module("io.kitti").objects_from_detections(self[:], calibration, **options)
+
+    def draw(self, xyz: np.ndarray | None = None, *, frame: Any = None, title: str = "") -> np.ndarray:
+        """Draws the boxes from above, see `jaxbox.viz.draw_detections`."""
+        return later_module("viz.answer").draw_detections(self, xyz, frame=frame, title=title)
+
     def raise_if_failed(self) -> None:
         """Raises where anything was dropped for want of capacity, naming the field to enlarge.
 
-        It takes the answer of one sweep: of a batch, take one row by `jax.tree.map` first.
+        It takes the answer of one sweep: of a batch, take one from `unstack` first.
 
         Raises:
           RuntimeError: one line a failure, with the configuration field and the size needed.

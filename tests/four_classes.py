@@ -9,11 +9,11 @@ from test_io_kitti import make_detections
 
 import jaxbox
 from jaxbox import DetectorConfig, Label, io, reference, synthetic, viz
+from jaxbox.config.class_priors import classes_in_words
 from jaxbox.config.fields import all_fields, config_from_toml, config_to_toml
 from jaxbox.evaluation.matching import NEIGHBOURS
 from jaxbox.io.foxglove import COLORS
 from jaxbox.io.kitti import VEHICLE_TYPES, objects_from_detections
-from jaxbox.run.summary import classes_in_words
 from jaxbox.synthetic.camera import make_calibration
 from jaxbox.synthetic.scene import draw_size
 from jaxbox.synthetic.solids import vehicle_solids

@@ -18,7 +18,7 @@ PROJECT = ROOT.parent
 
 # Each layer may import those before it, and itself.
 LAYERS = [
-    {"_version", "_extras", "_files", "_padding", "config", "types", "geometry", "xla"},
+    {"_version", "_extras", "_files", "_padding", "_box", "_box_rows", "config", "types", "geometry", "xla"},
     {"stages"},
     {"detector"},
     {"tracking"},
@@ -92,6 +92,13 @@ def test_imports_go_down_the_layers_only(path):
         return
     wrong = set(imported_rooms(path)) - ALLOWED[room] - {room}
     assert not wrong, f"{path.name} of {room} imports {sorted(wrong)}"
+
+
+def test_only_what_people_call_on_boxes_imports_by_name_and_so_past_the_layers():
+    importing = [path for path in source_files() if 'import_module(f"jaxbox' in path.read_text()]
+    assert [relative(path) for path in importing] == ["_box_rows.py"]
+    calls = {relative(path) for path in source_files() if "later_module(" in path.read_text()}
+    assert calls == {"_box_rows.py", "types.py", "tracking/tracks.py"}
 
 
 def test_every_room_has_a_layer():

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from jaxbox.cli.console import printable
 from jaxbox.config import DEFAULT_SCORE_THRESHOLD
-from jaxbox.run.summary import classes_in_words
+from jaxbox.config.class_priors import classes_in_words
 from jaxbox.types import Detections, Status
 
 SHOWN_MIN_SCORE = DEFAULT_SCORE_THRESHOLD

@@ -3,10 +3,12 @@
 Every field is compared with data, and is traced; lengths are metres.
 """
 
+import collections
 import dataclasses
 import enum
 
 import jax
+import numpy as np
 
 _HISSING = ("s", "x", "z", "ch", "sh")
 """Words that end so take -es in the plural."""
@@ -163,4 +165,24 @@ class Label(enum.IntEnum):
         prior_weight=0.3,
         count_max_height_m=4.2,
         recess_m=-1.0,
+    )
+
+
+def classes_in_words(labels: np.ndarray) -> str:
+    """How many of each class there are.
+
+    Args:
+      labels: (k,) int, of `Label`.
+
+    Returns:
+      Words; empty for none.
+
+    >>> classes_in_words(np.array([0, 1, 0, 0]))
+    '3 cars, 1 van'
+    """
+    counts = collections.Counter(Label(label) for label in labels.tolist())
+    return ", ".join(
+        f"{counts[label]} {label.plural if counts[label] > 1 else label.word}"
+        for label in Label
+        if counts[label]
     )

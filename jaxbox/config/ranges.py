@@ -68,7 +68,7 @@ _POSITIVE = """
 """Divisors, and what leaves nothing to find at zero. Zero for a map's greatest height turns the map off."""
 
 _SHARES = """
-    ground.min_inlier_fraction box.direction_max_free completion.seen_weight
+    ground.min_inlier_fraction ground.min_support_share box.direction_max_free completion.seen_weight
     vehicles.top_quantile vehicles.upright_score vehicles.min_score vehicles.max_overlap
     birth_score high_score low_score hidden_share yaw_memory yaw_memory_moving turn_gain
 """

@@ -6,17 +6,19 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxbox.config import DetectorConfig
+from jaxbox.run.arguments import as_cloud, as_config, as_key
 from jaxbox.run.compiled import detect
 from jaxbox.types import Detections, PointCloud
 from jaxbox.xla.backend import default_device
 
 
 def detect_batch(
-    clouds: Sequence[PointCloud],
-    config: DetectorConfig | None = None,
-    key: jax.Array | None = None,
+    clouds: Sequence[PointCloud | ArrayLike],
+    config: DetectorConfig | str | None = None,
+    key: jax.Array | int | None = None,
     devices: Sequence[Any] | None = None,
 ) -> list[Detections]:
     """Finds the vehicles of many sweeps, over several devices in parallel.
@@ -30,21 +32,24 @@ def detect_batch(
     ``jax.config.update("jax_num_cpu_devices", 2)``.
 
     Args:
-      clouds: any number, of any capacities.
-      config: the settings of all; None for the default preset.
-      key: the JAX random key of all; None for `jax.random.key(0)`.
+      clouds: any number, of any capacities; arrays are padded as `detect` pads them.
+      config: the settings of all, or the name of a preset; None for the default preset.
+      key: the JAX random key of all, or an integer, its seed; None for 0.
       devices: JAX devices to compute on; None for all of this process.
 
     Returns:
-      The detections of each sweep in the order of the clouds, as `detect(cloud, config, key)` gives them,
-      each on its device. They may still be computing.
+      The detections of each sweep in the order of the clouds, as `detect(cloud, config, key)` gives them for
+      clouds, each on its device. They may still be computing.
 
     Raises:
-      ValueError: for no devices, or settings that contradict each other.
+      ValueError: for no devices, settings that contradict each other, or arrays of other shapes.
+      TypeError: as `detect`.
     """
     devices = checked_devices(devices)
-    turns = itertools.islice(itertools.cycle(devices), len(clouds))
-    return [detect_on(device, cloud, config, key) for device, cloud in zip(turns, clouds, strict=True)]
+    config, one_key = as_config(config), as_key(key)
+    padded = [as_cloud(cloud, called="jaxbox.detect_batch") for cloud in clouds]
+    turns = itertools.islice(itertools.cycle(devices), len(padded))
+    return [detect_on(device, cloud, config, one_key) for device, cloud in zip(turns, padded, strict=True)]
 
 
 def checked_devices(devices: Sequence[Any] | None) -> Sequence[Any]:

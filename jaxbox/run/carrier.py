@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from jaxbox.geometry.rigid import relative_rigid
+from jaxbox.run.arguments import ReadSweep
 from jaxbox.run.streaming import ReadableSweep
 from jaxbox.tracking.odometry import KissIcp, ego_motion_from_boxes
 from jaxbox.tracking.poses import Poses, PoseSource, check_pose, deskew
@@ -163,22 +164,6 @@ ESTIMATED = {
     PoseSource.NONE: Standing,
 }
 """Sources that are no file, by the words that ask for them."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ReadSweep:
-    """A sweep whose points are at hand."""
-
-    name: str
-    """Of the sweep."""
-    xyz: np.ndarray
-    """(n, 3) float32, m, sensor frame."""
-    intensity: np.ndarray | None
-    """(n,) float32, or None."""
-
-    def read_points(self) -> tuple[np.ndarray, np.ndarray | None]:
-        """The points."""
-        return self.xyz, self.intensity
 
 
 @dataclasses.dataclass(frozen=True)

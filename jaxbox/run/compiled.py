@@ -9,11 +9,13 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxbox import detector
 from jaxbox.config import DetectorConfig
 from jaxbox.config.checks import check_config
 from jaxbox.detector import Segments, find_vehicles
+from jaxbox.run.arguments import as_cloud, as_config, as_key
 from jaxbox.types import Detections, PointCloud
 from jaxbox.xla import chunks
 from jaxbox.xla.backend import batch_together, building_for, default_device, is_on_device, on_accelerator
@@ -21,9 +23,14 @@ from jaxbox.xla.barriers import single_kernel
 
 
 def detect(
-    cloud: PointCloud, config: DetectorConfig | None = None, key: jax.Array | None = None
+    cloud: PointCloud | ArrayLike,
+    config: DetectorConfig | str | None = None,
+    key: jax.Array | int | None = None,
 ) -> Detections:
     """Finds the vehicles of one sweep.
+
+    At the prompt: ``jaxbox.detect(xyz)``, ``jaxbox.detect(xyz, "fast")``. An array is padded to a usual
+    capacity, and its answer is that of the cloud, on the host and without padding.
 
     One jitted function of fixed shape: it compiles once for each capacity and set of static fields, and
     never again when sweeps change length or thresholds move. `jax.vmap` it over a batch of clouds, of
@@ -33,20 +40,26 @@ def detect(
     over devices.
 
     Args:
-      cloud: one sweep, see `PointCloud.from_numpy`.
-      config: the configuration; None for the default preset.
-      key: JAX random key for RANSAC; None for `jax.random.key(0)`. On a CPU the same key gives the same bits.
+      cloud: one sweep, see `PointCloud.from_numpy`; or an array (n, 3 or more) of x, y, z in m, sensor frame,
+        and where there are more columns the intensity.
+      config: the configuration, or the name of a preset: "default", "fast" or "paper"; None for the default.
+      key: JAX random key for RANSAC, or an integer, its seed; None for 0. On a CPU the same key gives the
+        same bits.
 
     Returns:
       The detections, best score first. Whatever was dropped is in `status` and `counts`.
 
     Raises:
-      ValueError: for fields that contradict each other, or arrays of other shapes than `PointCloud` says.
+      ValueError: for fields that contradict each other, a name that no preset has, or arrays of other shapes
+        than `PointCloud` says.
+      TypeError: for what is no cloud, no array, no configuration or no key.
 
     Status bits: all of `Status`; `Detections.raise_if_failed` turns those of full capacities into an error.
 
     Reference: paper, section 3; oracle `jaxbox.reference.detect`.
     """
+    if not isinstance(cloud, PointCloud):
+        return detect(as_cloud(cloud, called="jaxbox.detect"), config, key)[:]
     operands = _operands(cloud, config, key)
     detections = None if _programs is None else _programs(*operands)
     return _detect_jit(*operands) if detections is None else detections
@@ -85,8 +98,8 @@ def kept_programs() -> Programs | None:
 
 def lower(
     cloud: PointCloud,
-    config: DetectorConfig | None = None,
-    key: jax.Array | None = None,
+    config: DetectorConfig | str | None = None,
+    key: jax.Array | int | None = None,
     *,
     platform: str | None = None,
 ) -> jax.stages.Lowered:
@@ -148,9 +161,9 @@ class PackedConfig:
 
 
 def _operands(
-    cloud: PointCloud, config: DetectorConfig | None, key: jax.Array | None
+    cloud: PointCloud, config: DetectorConfig | str | None, key: jax.Array | int | None
 ) -> tuple[PointCloud, PackedConfig, jax.Array]:
-    config = DetectorConfig() if config is None else config
+    config = as_config(config)
     check_config(config)
     if isinstance(cloud.num_points, np.ndarray | np.generic | int) and np.any(cloud.num_points < 0):
         raise ValueError(
@@ -162,7 +175,7 @@ def _operands(
     if isinstance(known, np.ndarray) and is_on_device(cloud.xyz1) and device in cloud.xyz1.devices():
         # Nothing is sent in a call whose arrays are all there, see `jax.transfer_guard`.
         packed = dataclasses.replace(packed, thresholds=_on_device(known.tobytes(), device))
-    return cloud, packed, _default_key() if key is None else key
+    return cloud, packed, as_key(key)
 
 
 @functools.lru_cache(maxsize=64)
@@ -170,12 +183,6 @@ def _on_device(thresholds: bytes, _device: Any) -> jax.Array:
     """Thresholds (T,) float32 on the default device, sent once."""
     with jax.ensure_compile_time_eval():
         return jax.device_put(np.frombuffer(thresholds, np.float32))
-
-
-@functools.cache
-def _default_key() -> jax.Array:
-    with jax.ensure_compile_time_eval(), jax.transfer_guard("allow"):
-        return jax.random.key(0)
 
 
 def count_compilations() -> int:

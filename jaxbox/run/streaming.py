@@ -9,10 +9,13 @@ from typing import Any, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 
+from jaxbox._box import ByValue
 from jaxbox._padding import aligned_empty, checked_points, fill_rows, fitting_capacity
 from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.config.checks import check_config
+from jaxbox.run.arguments import as_config, as_key, as_sweeps
 from jaxbox.run.batching import checked_devices, detect_on
 from jaxbox.run.processes import ProcessPool, WorkerDied, ahead
 from jaxbox.types import Detections, PointCloud
@@ -34,8 +37,8 @@ class ReadableSweep(Protocol):
         ...
 
 
-@dataclasses.dataclass(frozen=True)
-class StreamedSweep:
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class StreamedSweep(ByValue):
     """One sweep that went through, or did not."""
 
     name: str
@@ -47,11 +50,15 @@ class StreamedSweep:
     error: str | None
     """Why the sweep failed; None where it did not."""
 
+    def __repr__(self) -> str:
+        """The name, and what was found or why nothing was."""
+        return f"{type(self).__name__} {self.name}: {self.error or self.detections}"
+
 
 def stream(
-    sweeps: Iterable[ReadableSweep],
-    config: DetectorConfig | None = None,
-    key: jax.Array | None = None,
+    sweeps: Iterable[ReadableSweep | PointCloud | ArrayLike],
+    config: DetectorConfig | str | None = None,
+    key: jax.Array | int | None = None,
     *,
     capacity: int | None = None,
     workers: int = 1,
@@ -69,9 +76,10 @@ def stream(
     It asks for sweeps before their turn: a sensor's, which come one by one, are for `detect`.
 
     Args:
-      sweeps: what `jaxbox.io.open_sweeps` gives, or the like; with several workers they are pickled.
-      config: the settings of all; None for the default preset.
-      key: the JAX random key of all; None for `jax.random.key(0)`.
+      sweeps: what `jaxbox.io.open_sweeps` gives, or the like; with several workers they are pickled. Arrays
+        (n, 3 or more), as `detect` takes them, are named by their number: "000000".
+      config: the settings of all, or the name of a preset; None for the default preset.
+      key: the JAX random key of all, or an integer, its seed; None for 0.
       capacity: points that every sweep is padded to; None for the bucket that holds it.
       workers: processes; with 1 it is this one.
       devices: JAX devices of this process to compute on; None for all of them, and with several
@@ -86,7 +94,8 @@ def stream(
 
     Raises:
       ValueError: for settings that contradict each other, workers below 1, no devices, or devices together
-        with several workers.
+        with several workers; when its turn comes, for an array of another shape.
+      TypeError: for one sweep or a path instead of sweeps; when its turn comes, for what is no sweep.
     """
     if track is not None:
         from jaxbox.run import tracking  # noqa: PLC0415 - it is built on this module
@@ -96,13 +105,14 @@ def stream(
         )
     if workers < 1:
         raise ValueError(f"workers is {workers}; it must be at least 1.")
-    config = DetectorConfig() if config is None else config
+    config = as_config(config)
     check_config(config)
+    readable, one_key = as_sweeps(sweeps, called="jaxbox.stream"), None if key is None else as_key(key)
     if workers == 1:
-        return _stream_here(sweeps, config, key, capacity, checked_devices(devices))
+        return _stream_here(readable, config, one_key, capacity, checked_devices(devices))
     if devices is not None:
         raise ValueError(f"workers is {workers} and devices are named; name one of the two.")
-    return _stream_apart(sweeps, _Settings.pack(config, key, capacity), workers)
+    return _stream_apart(readable, _Settings.pack(config, one_key, capacity), workers)
 
 
 class _Buffer:

@@ -3,7 +3,6 @@
 All on the host, from what `detect` returns anyway; `jaxbox.summarise` is the way in.
 """
 
-import collections
 import dataclasses
 import math
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ import numpy as np
 from jaxbox.config import DEFAULT_SCORE_THRESHOLD, DetectorConfig
 from jaxbox.config.capacities import CAPACITIES, CLOUD_CAPACITY
 from jaxbox.config.schema import GROUND_CANDIDATE_CELL_M
+from jaxbox.run.arguments import as_config
 from jaxbox.types import NUM_POINT_COUNTS, Counts, Detections, GroundPlane, Label, Status
 
 POINT_PLACES = tuple(field.name for field in dataclasses.fields(Counts)[:NUM_POINT_COUNTS])
@@ -95,26 +95,6 @@ class GroundSummary:
         )
 
 
-def classes_in_words(labels: np.ndarray) -> str:
-    """How many of each class there are.
-
-    Args:
-      labels: (k,) int, of `Label`.
-
-    Returns:
-      Words; empty for none.
-
-    >>> classes_in_words(np.array([0, 1, 0, 0]))
-    '3 cars, 1 van'
-    """
-    counts = collections.Counter(Label(label) for label in labels.tolist())
-    return ", ".join(
-        f"{counts[label]} {label.plural if counts[label] > 1 else label.word}"
-        for label in Label
-        if counts[label]
-    )
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Summary:
     """What happened to one sweep, in numbers and words."""
@@ -171,7 +151,7 @@ class Summary:
 
 def summarise(
     detections: Detections,
-    config: DetectorConfig | None = None,
+    config: DetectorConfig | str | None = None,
     *,
     min_score: float = DEFAULT_SCORE_THRESHOLD,
 ) -> Summary:
@@ -180,14 +160,15 @@ def summarise(
     It waits for the answer and works on the host.
 
     Args:
-      detections: of one sweep: of a batch, take one row by `jax.tree.map` first.
-      config: the settings that `detect` had, which say how large each capacity is; None for the default.
+      detections: of one sweep: of a batch, take one from `Detections.unstack`.
+      config: the settings that `detect` had, or the name of a preset, which say how large each capacity is;
+        None for the default.
       min_score: boxes with lower scores are not listed.
 
     Returns:
       The summary; its `to_dict` is for JSON.
     """
-    config = DetectorConfig() if config is None else config
+    config = as_config(config)
     counts, score = detections.counts, np.asarray(detections.score)
     keep = np.asarray(detections.valid) & (score >= min_score)
     label, center, size = (

@@ -8,10 +8,12 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.typing import ArrayLike
 
 from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.config.checks import check_ranges
 from jaxbox.geometry.rigid import relative_rigid
+from jaxbox.run.arguments import as_sweeps
 from jaxbox.run.carrier import Carrier, Clock, make_carrier, prepared, without_points
 from jaxbox.run.streaming import ReadableSweep, StreamedSweep, stream
 from jaxbox.tracking.poses import Poses, PoseSource, check_pose, orthonormal_pose
@@ -19,7 +21,7 @@ from jaxbox.tracking.smoothing import smooth
 from jaxbox.tracking.state import Observations, TrackerState, observe
 from jaxbox.tracking.step import track_step
 from jaxbox.tracking.tracks import Tracks, TrackStatus
-from jaxbox.types import Detections
+from jaxbox.types import Detections, PointCloud
 
 RATE_HZ = 10.0
 """Sweeps a second of most sensors, where nothing says when sweeps were taken."""
@@ -32,7 +34,7 @@ _SOURCE_BITS = {
 }
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class TrackedSweep(StreamedSweep):
     """One sweep that went through detector and tracker, or did not."""
 
@@ -48,6 +50,10 @@ class TrackedSweep(StreamedSweep):
     pose_source: PoseSource
     """Where the pose is from."""
 
+    def __repr__(self) -> str:
+        """The name, and the tracks or why there are none."""
+        return f"{type(self).__name__} {self.name}: {self.error or self.tracks}"
+
     @property
     def status(self) -> TrackStatus:
         """What happened in the tracker; `OK` where the sweep failed."""
@@ -55,12 +61,12 @@ class TrackedSweep(StreamedSweep):
 
 
 def track(
-    sweeps: Iterable[ReadableSweep],
-    config: DetectorConfig | None = None,
+    sweeps: Iterable[ReadableSweep | PointCloud | ArrayLike],
+    config: DetectorConfig | str | None = None,
     track_config: TrackConfig | None = None,
     *,
     poses: Poses | np.ndarray | PoseSource | str | None = None,
-    key: jax.Array | None = None,
+    key: jax.Array | int | None = None,
     capacity: int | None = None,
     max_tracks: int = MAX_TRACKS,
     rate_hz: float = RATE_HZ,
@@ -73,12 +79,13 @@ def track(
     `rate_hz`. Where points carry times, poses also take the distortion by the sensor's own motion away.
 
     Args:
-      sweeps: of one sequence in the order of time, such as `jaxbox.io.open_sweeps` gives of one drive.
-      config: the settings of the detector; None for the default preset.
+      sweeps: of one sequence in the order of time, such as `jaxbox.io.open_sweeps` gives of one drive, or
+        arrays as `stream` takes them.
+      config: the settings of the detector, or the name of a preset; None for the default preset.
       track_config: those of the tracker; None for the defaults.
       poses: T_world_sensor of each sweep, (F, 4, 4) or `Poses`; or where to take them from: "kiss-icp" (extra
         ``track``), "boxes" or "none". None for kiss-icp where it is installed, else the boxes.
-      key: the JAX random key of all; None for `jax.random.key(0)`.
+      key: the JAX random key of all, or an integer, its seed; None for 0.
       capacity: points that every sweep is padded to; None for the bucket that holds it.
       max_tracks: capacity for vehicles at a time.
       rate_hz: sweeps a second, where nothing says when they were taken.
@@ -99,10 +106,11 @@ def track(
     clock = Clock(rate_hz, poses.times_ns if isinstance(poses, Poses) else None)
     track_config = TrackConfig() if track_config is None else track_config
     check_ranges(track_config)
+    readable = as_sweeps(sweeps, called="jaxbox.track")
     tracker = _Tracker(track_config, carrier.source, max_tracks)
     begun: collections.deque[ReadableSweep] = collections.deque()
     streamed = stream(
-        prepared(sweeps, carrier, begun), config, key, capacity=capacity, workers=workers, devices=devices
+        prepared(readable, carrier, begun), config, key, capacity=capacity, workers=workers, devices=devices
     )
     return _track(streamed, begun, carrier, clock, tracker)
 

@@ -5,11 +5,17 @@ Axis letters: T slots, D detections, L classes. A slot without a vehicle has ``i
 
 import dataclasses
 import enum
+import math
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from jaxbox.types import to_host
+from jaxbox._box import Box
+from jaxbox._box_rows import BoxRows, later_module
+from jaxbox.config.class_priors import Label, classes_in_words
+from jaxbox.types import Calibration, Motion, to_host
 
 FREE = -1
 """`Tracks.id` of a slot without a vehicle, and `Tracks.detection` of a vehicle that was not detected."""
@@ -100,10 +106,49 @@ class TrackCounts:
         )
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class Track(Box):
+    """One vehicle of a tracker after a sweep, as iterating over `Tracks` gives it."""
+
+    id: int
+    """The same for a vehicle in all sweeps."""
+    confirmed: bool
+    """Whether it was detected often enough to be shown."""
+    age: int
+    """Sweeps since its first detection, which counts as 1."""
+    hits: int
+    """Sweeps in which it was detected."""
+    sight: Sight
+    """Whether it was detected in this sweep, and if not, why."""
+    detection: int
+    """Row of its detection in this sweep, -1 where it has none."""
+    motion: Motion
+    """What it does."""
+    velocity: np.ndarray
+    """(2,) float32, m/s, over ground, along the axes of this sweep's sensor frame."""
+    turn_rate: float
+    """Rad/s, about +z."""
+
+    @property
+    def speed(self) -> float:
+        """m/s, over ground."""
+        return math.hypot(*self.velocity)
+
+    def __str__(self) -> str:
+        """One line: the number, the box, the speed and what it does."""
+        unseen = "" if self.sight is Sight.SEEN else f" ({self.sight.name.lower()})"
+        return f"{self.id:4}  {super().__str__()}  {self.speed:4.1f} m/s  {self.motion.word}{unseen}"
+
+
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Tracks:
-    """The vehicles that a tracker knows after one sweep, one a slot."""
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Tracks(BoxRows[Track]):
+    """The vehicles that a tracker knows after one sweep, one a slot.
+
+    Arrays of T slots, of which those of ``valid`` count, as a compiled function needs them. On the host it is
+    also a sequence of `Track` in the order of the slots, with the choices and tables of `jaxbox.Detections`:
+    ``tracks[tracks.confirmed]``, ``tracks.of("van")``, ``tracks.to_pandas()``.
+    """
 
     id: jax.Array
     """(T,) int32: the same for a vehicle in all sweeps, and never used again; -1 for a free slot."""
@@ -163,6 +208,9 @@ class Tracks:
     status: jax.Array
     """() int32: `TrackStatus` bits."""
 
+    _of_sweep: ClassVar[frozenset[str]] = frozenset(("counts", "status"))
+    """Fields that have no row for each track."""
+
     @property
     def speed(self) -> jax.Array:
         """(T,) float32, m/s, over ground."""
@@ -171,3 +219,71 @@ class Tracks:
     def on_host(self) -> "Tracks":
         """The same in NumPy arrays, once they are computed."""
         return to_host(self, self.status)
+
+    def _box_at(self, row: int) -> Track:
+        """The track of a slot, which is valid, of a sweep on the host."""
+        return Track(
+            label=Label(self.label[row]),
+            score=float(self.score[row]),
+            center=np.asarray(self.center[row]),
+            size=np.asarray(self.size[row]),
+            yaw=float(self.yaw[row]),
+            heading=float(self.heading[row]),
+            front_probability=float(self.front_probability[row]),
+            id=int(self.id[row]),
+            confirmed=bool(self.confirmed[row]),
+            age=int(self.age[row]),
+            hits=int(self.hits[row]),
+            sight=Sight(self.sight[row]),
+            detection=int(self.detection[row]),
+            motion=Motion(self.motion[row]),
+            velocity=np.asarray(self.velocity[row]),
+            turn_rate=float(self.turn_rate[row]),
+        )
+
+    def _title(self) -> str:
+        """What there is, in a line, of a sweep on the host."""
+        words = classes_in_words(np.asarray(self.label)[self.valid]) or "no track"
+        num_confirmed = np.count_nonzero(self.valid & self.confirmed)
+        return f"{words}, {num_confirmed} confirmed; {TrackStatus(int(self.status)).name}"
+
+    def to_columns(self) -> dict[str, np.ndarray]:
+        """Columns as `jaxbox.io.parquet` has them: ``id`` first, then those of boxes, state and velocity."""
+        tracks = self[:]
+        words = {
+            "state": np.array([Motion(motion).word for motion in tracks.motion.tolist()], str),
+            "sight": np.array([Sight(sight).name.lower() for sight in tracks.sight.tolist()], str),
+        }
+        same = ("confirmed", "age", "hits")
+        return {
+            "id": np.asarray(tracks.id),
+            **super().to_columns(),
+            **words,
+            **{name: np.asarray(getattr(tracks, name)) for name in same},
+            **dict(zip(("velocity_x", "velocity_y"), np.asarray(tracks.velocity).T, strict=True)),
+            "speed": np.asarray(tracks.speed),
+            **{name: np.asarray(getattr(tracks, name)) for name in ("turn_rate", "lateral_shift_m")},
+        }
+
+    def to_kitti(
+        self, calibration: Calibration, *, frame: int, min_visible_fraction: float | None = None
+    ) -> list[Any]:
+        """The tracks that a camera sees as KITTI's objects of a frame, see `jaxbox.io.write_tracks`."""
+        tracks, kitti = self[:], later_module("io.kitti_tracking")
+        options = {} if min_visible_fraction is None else {"min_visible_fraction": min_visible_fraction}
+        return kitti.objects_from_tracks(
+            np.column_stack([tracks.center, tracks.size, tracks.heading]),
+            np.asarray(tracks.score),
+            np.asarray(tracks.id),
+            calibration,
+            frame=frame,
+            types=[track.label.word.capitalize() for track in tracks],
+            **options,
+        )
+
+    def draw(self, xyz: np.ndarray | None = None, *, frame: Any = None, title: str = "") -> np.ndarray:
+        """Draws the tracks from above, see `jaxbox.viz.draw_tracks`."""
+        points = np.zeros((0, 3)) if xyz is None else np.asarray(xyz)[:, :3]
+        return later_module("viz.tracks").draw_tracks(
+            points, self[:], frame=frame, title=title, confirmed=False
+        )

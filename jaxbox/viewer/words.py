@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from jaxbox.run.summary import classes_in_words
+from jaxbox.config.class_priors import classes_in_words
 from jaxbox.types import Detections, Motion, Status
 from jaxbox.viewer.drives import TrackedFrame
 from jaxbox.viewer.frames import Frame

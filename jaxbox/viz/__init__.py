@@ -4,6 +4,7 @@ Pictures are (height, width, 3) uint8 arrays, red green blue. Points and boxes a
 frame: x forward, y left, z up, metres.
 """
 
+from jaxbox.viz.answer import draw_detections
 from jaxbox.viz.bird_eye import BirdEyeFrame, draw_bird_eye
 from jaxbox.viz.boxes import BoxGroup, BoxSet
 from jaxbox.viz.canvas import save_png
@@ -26,6 +27,7 @@ __all__ = [
     "color_by_height",
     "color_by_id",
     "draw_bird_eye",
+    "draw_detections",
     "draw_drive",
     "draw_image_boxes",
     "draw_image_tracks",

@@ -105,6 +105,27 @@ def draw_swatches(
         column += 26 + cv2.getTextSize(text, FONT, 0.5, 1)[0][0] + LINE_STEP_PX
 
 
+def encode_png(picture: np.ndarray) -> bytes:
+    """A picture as the bytes of a PNG file.
+
+    Args:
+      picture: (h, w, 3) uint8, red green blue.
+
+    Returns:
+      The bytes.
+
+    Raises:
+      ValueError: for another shape or type.
+    """
+    picture = np.asarray(picture)
+    if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8 or picture.size == 0:
+        raise ValueError(
+            f"the picture has shape {picture.shape} and type {picture.dtype}; it must be (h, w, 3) uint8."
+        )
+    _, encoded = cv2.imencode(".png", picture[..., ::-1])
+    return encoded.tobytes()
+
+
 def save_png(path: str | os.PathLike[str], picture: np.ndarray) -> pathlib.Path:
     """Writes a picture as PNG, under a temporary name first.
 
@@ -118,12 +139,7 @@ def save_png(path: str | os.PathLike[str], picture: np.ndarray) -> pathlib.Path:
     Raises:
       ValueError: for another shape or type.
     """
-    picture = np.asarray(picture)
-    if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8 or picture.size == 0:
-        raise ValueError(
-            f"the picture has shape {picture.shape} and type {picture.dtype}; it must be (h, w, 3) uint8."
-        )
-    _, encoded = cv2.imencode(".png", picture[..., ::-1])
+    encoded = encode_png(picture)
     with atomic_path(path) as temporary:
-        temporary.write_bytes(encoded.tobytes())
+        temporary.write_bytes(encoded)
     return pathlib.Path(path)

@@ -42,7 +42,7 @@ def draw_stages(
     xyz = np.asarray(cloud.xyz1)[used, :3].astype(np.float64)
     raised = ~np.asarray(detections.ground_mask)[used]
     component = np.asarray(detections.point_component)[used]
-    by_height = color_by_height(_height_above_plane(xyz, detections))
+    by_height = color_by_height(height_above_plane(xyz, detections))
     by_cluster = color_by_id(component)
     boxes = BoxSet.from_detections(detections, min_score=min_score)
     common = {"boxes": boxes, "truth": truth, "judged": judged}
@@ -77,7 +77,8 @@ def hull_polygons(detections: Detections, *, min_score: float = 0.0) -> list[np.
     return [vertices[row, : counts[row]] for row in np.flatnonzero(keep & (counts > 0))]
 
 
-def _height_above_plane(xyz: np.ndarray, detections: Detections) -> np.ndarray:
+def height_above_plane(xyz: np.ndarray, detections: Detections) -> np.ndarray:
+    """Heights (n,) m of points (n, 3) m above the ground plane of the detections."""
     a, b, c = np.asarray(detections.ground.coefficients, np.float64)
     return xyz[:, 2] - (a * xyz[:, 0] + b * xyz[:, 1] + c)
 

@@ -1,0 +1,191 @@
+"""What people hand over: arrays for clouds and sweeps, names for presets, integers for keys."""
+
+import dataclasses
+import functools
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import jax
+import jax.core
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbox.config import DetectorConfig
+from jaxbox.types import PointCloud
+
+_COLUMNS = 3
+"""x, y, z; a fourth is the intensity."""
+_MAX_COLUMNS = 16
+"""An array of more columns has a row for x, one for y and one for z instead: no source has so many fields."""
+
+
+def as_config(config: DetectorConfig | str | None) -> DetectorConfig:
+    """The configuration of a preset's name.
+
+    Args:
+      config: a configuration, the name of a preset, or None for the default preset.
+
+    Returns:
+      The configuration.
+
+    Raises:
+      ValueError: for a name that no preset has.
+      TypeError: for what is no configuration.
+
+    >>> as_config("paper") == DetectorConfig.paper()
+    True
+    """
+    if config is None:
+        return DetectorConfig()
+    if isinstance(config, str):
+        presets = DetectorConfig.presets()
+        if config not in presets:
+            raise ValueError(f"{config!r} is no preset; there are {', '.join(presets)}.")
+        return presets[config]
+    if not isinstance(config, DetectorConfig):
+        raise TypeError(
+            f"config is {type(config).__name__}; give a DetectorConfig or the name of a preset. A seed is "
+            "key=..., another capacity is PointCloud.from_numpy(xyz, capacity=...)."
+        )
+    return config
+
+
+def as_key(key: Any) -> Any:
+    """The random key of a seed.
+
+    Args:
+      key: a JAX random key; an integer, which is a seed and may be traced; or None for the seed 0.
+
+    Returns:
+      The key.
+
+    Raises:
+      TypeError: for what is neither.
+    """
+    if key is None:
+        return _key_of(0)
+    if isinstance(key, int | np.integer) and not isinstance(key, bool):
+        return _key_of(int(key))
+    if isinstance(key, bool) or not hasattr(key, "dtype"):
+        raise TypeError(f"key is {key!r}; give an integer, or a key from jax.random.key(0).")
+    is_seed = key.shape == () and jnp.issubdtype(key.dtype, jnp.integer)
+    return jax.random.key(key) if is_seed else key
+
+
+@functools.lru_cache(maxsize=64)
+def _key_of(seed: int) -> jax.Array:
+    with jax.ensure_compile_time_eval(), jax.transfer_guard("allow"):
+        return jax.random.key(seed)
+
+
+def as_points(points: Any, *, called: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """The points of one sweep in an array.
+
+    Args:
+      points: (n, 3) or more columns, real numbers: x, y, z in m, sensor frame, and where there are more the
+        intensity; whatever NumPy can make an array of.
+      called: the function that was given them, for the message.
+
+    Returns:
+      xyz (n, 3), and intensity (n,) or None.
+
+    Raises:
+      TypeError: for what is no array, or is being traced.
+      ValueError: for another shape.
+    """
+    if isinstance(points, jax.core.Tracer):
+        raise TypeError(
+            f"{called} pads arrays on the host, and so takes none inside jax.jit or jax.vmap: hand over a "
+            "PointCloud there, from PointCloud.from_numpy and jaxbox.stack_clouds."
+        )
+    if isinstance(points, str | bytes) or hasattr(points, "__fspath__"):
+        raise TypeError(
+            f"{called} takes points and no file: read it, xyz, intensity = jaxbox.io.read_points({points!r})."
+        )
+    if hasattr(points, "read_points"):
+        raise TypeError(f"{called} takes points: read the sweep's, xyz, intensity = sweep.read_points().")
+    array = np.asarray(points)
+    if array.dtype.kind not in "fiu":
+        kind = f"{type(points).__qualname__} of {type(points).__module__}"
+        raise TypeError(f"{called} takes an array (n, 3) of real numbers or a PointCloud; this is {kind}.")
+    if array.ndim != 2 or not _COLUMNS <= array.shape[1] <= _MAX_COLUMNS:
+        mend = _mend(array)
+        raise ValueError(f"the points have shape {array.shape}; it must be (n, 3) or more columns{mend}.")
+    return array[:, :_COLUMNS], array[:, _COLUMNS] if array.shape[1] > _COLUMNS else None
+
+
+def _mend(array: np.ndarray) -> str:
+    """What to do about a wrong shape."""
+    if array.ndim == 3:
+        return ": one sweep at a time, or jaxbox.detect_batch(sweeps), jaxbox.stream(sweeps)"
+    if array.ndim == 2 and array.shape[1] > _MAX_COLUMNS:
+        return ": transpose it, points.T"
+    if array.ndim == 1:
+        return ": a file of float32 is np.fromfile(path, np.float32).reshape(-1, 4)"
+    return ", x, y and z in metres"
+
+
+def as_cloud(points: Any, *, called: str) -> PointCloud:
+    """A padded cloud of points in an array; clouds stay as they are.
+
+    Args:
+      points: a cloud, or as `as_points`.
+      called: the function that was given them, for the message.
+
+    Returns:
+      The cloud, of the smallest usual capacity that holds it.
+
+    Raises:
+      TypeError: as `as_points`.
+      ValueError: as `as_points`.
+    """
+    if isinstance(points, PointCloud):
+        return points
+    return PointCloud.from_numpy(*as_points(points, called=called))
+
+
+@dataclasses.dataclass(frozen=True)
+class ReadSweep:
+    """A sweep whose points are at hand."""
+
+    name: str
+    """Of the sweep."""
+    xyz: np.ndarray
+    """(n, 3) float32, m, sensor frame."""
+    intensity: np.ndarray | None
+    """(n,) float32, or None."""
+
+    def read_points(self) -> tuple[np.ndarray, np.ndarray | None]:
+        """The points."""
+        return self.xyz, self.intensity
+
+
+def as_sweeps(sweeps: Iterable[Any], *, called: str) -> Iterator[Any]:
+    """Sweeps of any kind one by one; arrays and clouds are named by their number.
+
+    Args:
+      sweeps: what has a name and `read_points`, arrays as `as_points` takes them, or clouds.
+      called: the function that was given them, for the message.
+
+    Returns:
+      What has a name and `read_points`.
+
+    Raises:
+      TypeError: for one sweep or one path instead of several; and as `as_points` when its turn comes.
+      ValueError: as `as_points`, when its turn comes.
+    """
+    if isinstance(sweeps, str | bytes) or hasattr(sweeps, "__fspath__"):
+        raise TypeError(f"{called} takes sweeps and no path: open them, jaxbox.io.open_sweeps({sweeps!r}).")
+    if isinstance(sweeps, PointCloud) or len(getattr(sweeps, "shape", ())) == 2:
+        raise TypeError(f"{called} takes sweeps and this is one: jaxbox.detect(xyz), or a list [xyz].")
+    return (_as_sweep(sweep, index, called) for index, sweep in enumerate(sweeps))
+
+
+def _as_sweep(sweep: Any, index: int, called: str) -> Any:
+    if hasattr(sweep, "read_points"):
+        return sweep
+    name = f"{index:06d}"
+    if isinstance(sweep, PointCloud):
+        rows = np.asarray(sweep.xyz1)[: int(sweep.num_points)]
+        return ReadSweep(name, rows[:, :_COLUMNS], np.asarray(sweep.intensity)[: len(rows)])
+    return ReadSweep(name, *as_points(sweep, called=called))
