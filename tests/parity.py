@@ -3,6 +3,7 @@
 A stage and its reference get the same float32 inputs, so that each answers for its own differences only.
 """
 
+import contextlib
 import dataclasses
 import functools
 import pathlib
@@ -33,6 +34,21 @@ MAX_CLUSTERS = 512
 CONFIG = DetectorConfig()
 
 
+@contextlib.contextmanager
+def building_for(*, accelerator):
+    """As `backend.building_for`, for whole detectors: those for accelerators compile without optimisation.
+
+    Nobody but the tests runs them on a CPU: their answers are to be right, not fast.
+    """
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", before or accelerator)
+    try:
+        with backend.building_for(accelerator=accelerator):
+            yield
+    finally:
+        jax.config.update("jax_disable_most_optimizations", before)
+
+
 class PerForm:
     """A function jitted once for each form of what is done otherwise on a CPU, see the fixture `platform`.
 
@@ -60,6 +76,14 @@ def in_both_forms(function, *args, **named):
         with backend.building_for(accelerator=accelerator):
             results.append(on_host(function(*args, **named)))
     return results
+
+
+@PerForm
+def _words_of(free, hits):
+    """Which cells are free, and which are hit, of (B, BLOCK, A) bool as words; see `Evidence`."""
+    # Where each free cell ends, the next begins: the compiled stage sums the two.
+    changes = jnp.diff(free.reshape(-1, free.shape[2]).astype(jnp.int32), axis=0, prepend=0)
+    return covered_words(changes.reshape(free.shape)), next_words(hits)
 
 
 def pad(rows, capacity, fill=0):
@@ -169,18 +193,13 @@ class Case:
 
     def evidence_as_input(self) -> Evidence:
         """The reference's evidence in the layout of the compiled stages."""
-        free, hits = (
-            jnp.asarray(flagged(sums).T).reshape(-1, BLOCK, len(sums))
+        blocks = (
+            flagged(sums).T.reshape(-1, BLOCK, len(sums))
             for sums in (self.evidence.free_sums, self.evidence.hit_sums)
         )
-        # Where each free cell ends, the next begins: the compiled stage sums the two.
-        changes = jnp.diff(free.reshape(-1, free.shape[2]).astype(jnp.int32), axis=0, prepend=0)
-        return Evidence(
-            free=covered_words(changes.reshape(free.shape)),
-            hit=next_words(hits),
-            support=jnp.asarray(self.evidence.support, jnp.float32),
-            num_ranges=CONFIG.evidence.num_ranges,
-        )
+        free, hit = _words_of(*blocks)
+        support = jnp.asarray(self.evidence.support, jnp.float32)
+        return Evidence(free=free, hit=hit, support=support, num_ranges=CONFIG.evidence.num_ranges)
 
     @functools.cached_property
     def boxes(self) -> list[tuple[Proposal, reference.CompletedBox | None]]:

@@ -7,6 +7,7 @@ import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
+import parity
 import pytest
 from native_loops import count_loops
 
@@ -15,7 +16,6 @@ from jaxbox.config import BoxConfig, EvidenceConfig
 from jaxbox.geometry.planar import rectangle_iou
 from jaxbox.io import open_sweeps
 from jaxbox.run import compiled
-from jaxbox.xla import backend
 from quality import bad_input
 
 CAPACITY = 2**14
@@ -191,20 +191,14 @@ def batch_anew(clouds):
     return find, compiled._operands(clouds, None, None)
 
 
-def test_a_batch_for_an_accelerator_has_the_shapes_of_the_singles_and_an_axis_more():
-    clouds = stack_clouds([PointCloud.from_numpy(street(seed).xyz, capacity=CAPACITY) for seed in (0, 1)])
-    with backend.building_for(accelerator=True):
-        find, operands = batch_anew(clouds)
-    assert_shapes_of_singles(jax.eval_shape(find, *operands), 2)
-
-
-def test_a_batch_on_an_accelerator_finds_what_the_singles_do_on_a_cpu():
+def test_a_batch_on_an_accelerator_finds_what_the_singles_do_on_a_cpu_in_their_shapes():
     sweeps = [street(0).xyz, np.zeros((0, 3)), street(1).xyz]
     clouds = stack_clouds([PointCloud.from_numpy(xyz, capacity=CAPACITY) for xyz in sweeps])
     # Run here, where it is slower: all sweeps at once, and each loop in its form for accelerators.
-    with backend.building_for(accelerator=True):
+    with parity.building_for(accelerator=True):
         find, operands = batch_anew(clouds)
-    many = jax.device_get(find(*operands))
+        many = jax.device_get(find(*operands))
+    assert_shapes_of_singles(many, len(sweeps))
     for row, xyz in enumerate(sweeps):
         single = run(xyz)
         # Rounded otherwise, so that a point on a border may fall to the other side of it.

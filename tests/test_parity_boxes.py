@@ -126,7 +126,7 @@ def test_hulls_of_random_points_are_those_of_opencv(size):
 def test_hulls_of_no_point_of_one_and_of_two_are_those_points():
     points = np.array([[[5, 7], [5, 7], [9, 8]]] * 3, np.float32)
     valid = np.array([[False] * 3, [True, True, False], [True] * 3])
-    vertices, count = trace_hulls(jnp.array(points), jnp.array(valid))
+    vertices, count = trace(points, valid)
     assert count.tolist() == [0, 1, 2]
     np.testing.assert_array_equal(vertices[0], np.zeros((MAX_VERTICES, 2)))
     np.testing.assert_array_equal(vertices[1], np.full((MAX_VERTICES, 2), [5, 7]))
@@ -208,9 +208,9 @@ def test_a_hull_beyond_its_capacity_keeps_every_so_many_of_its_vertices():
 def test_what_absent_points_hold_does_not_reach_a_hull(garbage):
     clouds = random_clouds(4, 10)
     valid = np.arange(10) % 3 != 0  # the first point is absent
-    expected = trace_hulls(jnp.array(clouds[:, valid]), jnp.ones((4, valid.sum()), bool))
+    expected = trace(clouds[:, valid], np.ones((4, valid.sum()), bool))
     spoilt = np.where(valid[:, None], clouds, np.float32(garbage))
-    found = trace_hulls(jnp.array(spoilt), jnp.tile(valid, (4, 1)))
+    found = trace(spoilt, np.tile(valid, (4, 1)))
     for ours, theirs in zip(found, expected, strict=True):
         np.testing.assert_array_equal(ours, theirs)
 

@@ -41,7 +41,7 @@ def detect(case, preset):
 @functools.cache
 def detect_in_form(case, preset, accelerator):
     cloud = jaxbox.PointCloud.from_numpy(case.xyz, capacity=parity.CAPACITY)
-    with backend.building_for(accelerator=accelerator):
+    with parity.building_for(accelerator=accelerator):
         return parity.on_host(jaxbox.detect(cloud, PRESETS[preset]))
 
 

@@ -1,5 +1,6 @@
 """Laws of what is built of rows: segments, lists, runs, bits, components, hulls, maps; in both forms."""
 
+import functools
 import itertools
 
 import jax
@@ -266,7 +267,14 @@ def test_words_at_are_those_of_the_cells_blocks_in_each_table():
 
 # Components.
 
-label = parity.PerForm(components.label_components, static_argnames=("row", "max_runs"))
+
+@functools.partial(parity.PerForm, static_argnames=("row", "max_runs"))
+def label(flags, row, max_runs):
+    """Components, and that of every cell: one program, however many of them are occupied."""
+    found = components.label_components(flags, row, max_runs=max_runs)
+    return found, found.at(jnp.arange(row.num_flags, dtype=jnp.int32))
+
+
 GRIDS = [((1, 1, 1),), ((40, 33, 1),), ((9, 8, 5),), ((12, 40, 1), (9, 8, 5), (5, 3, 1), (6, 5, 14))]
 
 
@@ -292,21 +300,21 @@ def assert_labelled(occupied):
     grids = components.CellGrids(tuple(cells.shape for cells in occupied))
     cells = [cells_of(grids, i, each) for i, each in enumerate(occupied)]
     flags = np.zeros(grids.num_flags, np.uint8)
-    flags[np.asarray(grids.flag(jnp.asarray(np.concatenate(cells))))] = 1
+    flags[np.asarray(grids.flag(jnp.arange(grids.num_flags)))[np.concatenate(cells)]] = 1
     max_runs = 1 + sum(cells.size for cells in occupied)
-    found = label(flags, grids, max_runs=max_runs)
+    found, of_cell = parity.on_host(label(flags, grids, max_runs=max_runs))
     first = 1
     for i, each in enumerate(occupied):
         expected, num = ndimage.label(each, np.ones((3, 3, 3)))
         assert int(found.first[i]) == first
-        np.testing.assert_array_equal(found.at(jnp.asarray(cells[i])), expected[each] + first - 1)
+        np.testing.assert_array_equal(of_cell[cells[i]], expected[each] + first - 1)
         # A run goes along the lines: of the height in space, of y in a bird's-eye view.
         line = 1 if each.shape[2] == 1 else 2
         begins = np.diff(each.astype(int), axis=line, prepend=0) == 1
         assert int(found.num_runs[i]) == begins.sum()
         first += num
     assert int(found.first[-1]) == first
-    assert int(found.at(jnp.int32([components.NONE]))[0]) == components.NONE
+    assert of_cell[components.NONE] == components.NONE
 
 
 @pytest.mark.usefixtures("platform")
