@@ -7,6 +7,7 @@ from jaxbox.run import serialization as _serialization  # noqa: F401 - jax.expor
 from jaxbox.run.batching import detect_batch
 from jaxbox.run.cache import enable_cache
 from jaxbox.run.compiled import detect
+from jaxbox.run.steps import ClusterBoxes, GroundPoints, cluster_points, fit_boxes, remove_ground
 from jaxbox.run.streaming import StreamedSweep, stream
 from jaxbox.run.summary import Summary, summarise
 from jaxbox.run.tracking import TrackedSweep, track
@@ -27,10 +28,12 @@ __all__ = [
     "DEFAULT_SCORE_THRESHOLD",
     "Box",
     "Calibration",
+    "ClusterBoxes",
     "Detection",
     "Detections",
     "DetectorConfig",
     "GroundPlane",
+    "GroundPoints",
     "Hulls",
     "Label",
     "Motion",
@@ -45,10 +48,13 @@ __all__ = [
     "TrackedSweep",
     "Tracks",
     "__version__",
+    "cluster_points",
     "detect",
     "detect_batch",
     "enable_cache",
+    "fit_boxes",
     "propose_capacities",
+    "remove_ground",
     "stack_clouds",
     "stream",
     "summarise",

@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox._box import Detection
+from jaxbox._box import ByValue, Detection
 from jaxbox._box_rows import BoxRows, later_module
 from jaxbox._padding import aligned_empty, checked_points, fill_rows, fitting_capacity
 from jaxbox.config import DetectorConfig
@@ -126,8 +126,8 @@ class Motion(enum.IntEnum):
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class PointCloud:
+@dataclasses.dataclass(frozen=True, eq=False)
+class PointCloud(ByValue):
     """One sweep, padded to a capacity N. Build it with `from_numpy`."""
 
     xyz1: jax.Array | np.ndarray
@@ -198,8 +198,8 @@ def stack_clouds(clouds: Sequence[PointCloud]) -> PointCloud:
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class GroundPlane:
+@dataclasses.dataclass(frozen=True, eq=False)
+class GroundPlane(ByValue):
     """The plane z = a x + b y + c that carries the most support."""
 
     coefficients: jax.Array
@@ -212,8 +212,8 @@ class GroundPlane:
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Hulls:
+@dataclasses.dataclass(frozen=True, eq=False)
+class Hulls(ByValue):
     """Convex hulls in the bird's-eye view, padded by repeating the last vertex."""
 
     vertices: jax.Array
@@ -223,8 +223,8 @@ class Hulls:
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Descriptors:
+@dataclasses.dataclass(frozen=True, eq=False)
+class Descriptors(ByValue):
     """Shape descriptors of each detection's points (paper, 3.5 and 4.4)."""
 
     moment_of_inertia: jax.Array
@@ -243,8 +243,8 @@ NUM_POINT_COUNTS = 9
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Counts:
+@dataclasses.dataclass(frozen=True, eq=False)
+class Counts(ByValue):
     """True counts of the whole sweep: where each point went, and what each capacity had to hold.
 
     Every point of the source sweep is in exactly one of the first nine, so they sum to
@@ -446,8 +446,8 @@ def _size_text(row: Capacity, counts: Counts) -> str:
 
 
 @jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Calibration:
+@dataclasses.dataclass(frozen=True, eq=False)
+class Calibration(ByValue):
     """A camera and where it stands relative to the LiDAR (paper, 3.6, equations 1-5)."""
 
     P_rect: jax.Array

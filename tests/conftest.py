@@ -32,6 +32,7 @@ FAST = {
 SLOW = {
     "test_another_class_is_one_entry_in_one_file",
     "rounds",
+    "test_the_pictures_of_the_tutorial_are_of_these_steps",
     "test_the_pipeline_strip_is_of_this_detector",
     "test_the_proposed_capacities_hold_the_sweeps_they_were_proposed_for",
     "test_the_readme_python_example_runs",

@@ -49,6 +49,7 @@ OWN = {
     "evaluation/kitti.py": "the benchmark's own rule for vans",
     "evaluation/tracking/protocol.py": "likewise",
     "io/foxglove.py": "chosen colours",
+    "io/nuscenes.py": "its name for vans",
     "synthetic/scene.py": "sizes and shares of a street's vehicles",
     "synthetic/solids.py": "shapes",
     "synthetic/traffic.py": "who plays which part in a drive",

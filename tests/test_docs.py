@@ -101,6 +101,17 @@ def test_the_pipeline_strip_is_of_this_detector(tmp_path):
     assert differing < 0.001, "python examples/pipeline_strip.py docs/pipeline.png"
 
 
+def test_the_pictures_of_the_tutorial_are_of_these_steps(tmp_path):
+    load(PROJECT / "examples" / "single_steps.py").main([str(tmp_path)])
+    names = re.findall(r"\((step_\w+\.png)\)", (PROJECT / "docs" / "tutorial.md").read_text())
+    assert sorted(names) == sorted(path.name for path in tmp_path.iterdir())
+    for name in names:
+        drawn, shown = read_image(tmp_path / name), read_image(PROJECT / "docs" / name)
+        assert drawn.shape == shown.shape
+        # As above.
+        assert np.any(drawn != shown, axis=-1).mean() < 0.001, "python examples/single_steps.py docs"
+
+
 def test_the_pages_of_the_navigation_are_the_pages_that_exist():
     named = set(re.findall(r"[\w/]+\.md", (PROJECT / "mkdocs.yml").read_text()))
     made = set(hook("project_pages").PAGES.values())

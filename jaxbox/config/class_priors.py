@@ -67,6 +67,26 @@ _NO_PROFILE = (1.0,) * 10
 """Of a class whose front and back look alike: nothing is known of its front."""
 
 
+def classes_in_words(labels: np.ndarray) -> str:
+    """How many of each class there are.
+
+    Args:
+      labels: (k,) int, of `Label`.
+
+    Returns:
+      Words; empty for none.
+
+    >>> classes_in_words(np.array([0, 1, 0, 0]))
+    '3 cars, 1 van'
+    """
+    counts = collections.Counter(Label(label) for label in labels.tolist())
+    return ", ".join(
+        f"{counts[label]} {label.plural if counts[label] > 1 else label.word}"
+        for label in Label
+        if counts[label]
+    )
+
+
 class Label(enum.IntEnum):
     """The vehicle classes, by the number that `Detections.label` holds: their places in this table.
 
@@ -165,24 +185,4 @@ class Label(enum.IntEnum):
         prior_weight=0.3,
         count_max_height_m=4.2,
         recess_m=-1.0,
-    )
-
-
-def classes_in_words(labels: np.ndarray) -> str:
-    """How many of each class there are.
-
-    Args:
-      labels: (k,) int, of `Label`.
-
-    Returns:
-      Words; empty for none.
-
-    >>> classes_in_words(np.array([0, 1, 0, 0]))
-    '3 cars, 1 van'
-    """
-    counts = collections.Counter(Label(label) for label in labels.tolist())
-    return ", ".join(
-        f"{counts[label]} {label.plural if counts[label] > 1 else label.word}"
-        for label in Label
-        if counts[label]
     )

@@ -147,7 +147,7 @@ class Tracks(BoxRows[Track]):
 
     Arrays of T slots, of which those of ``valid`` count, as a compiled function needs them. On the host it is
     also a sequence of `Track` in the order of the slots, with the choices and tables of `jaxbox.Detections`:
-    ``tracks[tracks.confirmed]``, ``tracks.of("van")``, ``tracks.to_pandas()``.
+    ``tracks[tracks.confirmed]``, ``tracks.of("car")``, ``tracks.to_pandas()``.
     """
 
     id: jax.Array
