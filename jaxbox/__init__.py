@@ -1,5 +1,6 @@
 """jaxbox: training-free LiDAR vehicle detection as one compiled JAX function."""
 
+from jaxbox._interrupts import release as _release
 from jaxbox._version import __version__
 from jaxbox.config import DEFAULT_SCORE_THRESHOLD, DetectorConfig, TrackConfig, propose_capacities
 from jaxbox.run import serialization as _serialization  # noqa: F401 - jax.export learns the types below
@@ -50,3 +51,5 @@ __all__ = [
     "summarise",
     "track",
 ]
+
+_release()

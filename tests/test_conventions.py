@@ -18,7 +18,7 @@ PROJECT = ROOT.parent
 
 # Each layer may import those before it, and itself.
 LAYERS = [
-    {"_version", "_extras", "_files", "_padding", "config", "types", "geometry", "xla"},
+    {"_version", "_extras", "_files", "_interrupts", "_padding", "config", "types", "geometry", "xla"},
     {"stages"},
     {"detector"},
     {"tracking"},
