@@ -1,6 +1,7 @@
 """jaxbox: training-free LiDAR vehicle detection as one compiled JAX function."""
 
 from jaxbox._box import Box, Detection
+from jaxbox._interrupts import release as _release
 from jaxbox._version import __version__
 from jaxbox.config import DEFAULT_SCORE_THRESHOLD, DetectorConfig, TrackConfig, propose_capacities
 from jaxbox.run import serialization as _serialization  # noqa: F401 - jax.export learns the types below
@@ -60,3 +61,5 @@ __all__ = [
     "summarise",
     "track",
 ]
+
+_release()

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from benchmarks import common
-from jaxbox import DetectorConfig, PointCloud, Status, detect
+from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig, PointCloud, Status, detect
 from jaxbox.types import GROUND_ABOVE_M
 from quality import bad_input, bad_input_table
 
@@ -51,6 +51,38 @@ def test_the_ground_may_be_as_high_as_the_origin_but_not_above_it(preset):
         found = detect(cloud, DetectorConfig.presets()[preset])
         assert (Status.GROUND_ABOVE in Status(int(found.status))) == expected
         assert float(found.ground.coefficients[2]) == pytest.approx(above_m, abs=0.05)
+
+
+FRAMES = {
+    "another axis up: y": (lambda xyz: xyz[:, [1, 2, 0]], Status.NO_GROUND),
+    "another axis up: x": (lambda xyz: xyz[:, [2, 1, 0]] * [1, 1, -1], Status.NO_GROUND),
+    # A facade is as good a plane as a road.
+    "a camera's": (lambda xyz: xyz[:, [1, 2, 0]] * [-1, -1, 1], Status.OK),
+    "upside down": (lambda xyz: xyz * [1, -1, -1], Status.GROUND_ABOVE),
+    "millimetres": (lambda xyz: xyz * 1000, Status.EMPTY | Status.NO_GROUND),
+    "a map's": (lambda xyz: np.add(xyz, [1000, 500, 100]), Status.EMPTY | Status.NO_GROUND),
+    "kilometres": (lambda xyz: xyz / 1000, Status.OK),
+    "turned": (lambda xyz: xyz[:, [1, 0, 2]] * [-1, 1, 1], Status.OK),
+    "mirrored": (lambda xyz: xyz * [1, -1, 1], Status.OK),
+    "on the ground": (lambda xyz: np.add(xyz, [0, 0, 1.73]), Status.OK),
+}
+FOUND_IN = ("turned", "mirrored", "on the ground")
+"""Frames in which vehicles are found nearly as in the right one, and nothing says that it is another."""
+
+
+@pytest.mark.parametrize("name", FRAMES)
+def test_the_status_says_of_a_wrong_frame_what_the_documentation_says(name):
+    move, status = FRAMES[name]
+    cloud = PointCloud.from_numpy(move(bad_input.street()), capacity=bad_input.CAPACITY)
+    found = detect(cloud, DetectorConfig())
+    assert Status(int(found.status)) == status
+    num_found = int((found.score >= DEFAULT_SCORE_THRESHOLD).sum())
+    expected = int((answer(bad_input.STREET.name, "default")[1].score >= DEFAULT_SCORE_THRESHOLD).sum())
+    assert expected > 3
+    if name in FOUND_IN:
+        assert abs(num_found - expected) <= 1
+    elif name != "upside down":
+        assert num_found == 0
 
 
 @pytest.mark.parametrize("name", [case.name for case in bad_input.STORAGE])

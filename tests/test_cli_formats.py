@@ -193,7 +193,7 @@ def test_interrupted_the_files_are_whole_and_the_rest_can_be_resumed(
     with monkeypatch.context() as patch, heard_ctrl_c():
         patch.setattr(io.Sweep, "read_points", interrupted)
         result = detect(tmp_path, *paths, *ONE_FILE)
-    assert result.exit_code == 1
+    assert result.exit_code == 130
     assert "--resume goes on" in result.stderr
     done = [record["name"] for record in records_of(tmp_path)]
     assert done in (["a"], ["a", "b"])

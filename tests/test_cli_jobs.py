@@ -110,7 +110,7 @@ def test_ctrl_c_ends_the_workers_and_what_is_done_is_whole(street, alone, tmp_pa
             result = run("detect", street, "--output", tmp_path, *COMMON, "--jobs", "2")
     finally:
         signal.signal(signal.SIGINT, before)
-    assert result.exit_code == 1
+    assert result.exit_code == 130
     assert "--resume goes on" in result.stderr
     assert "worker" not in result.stderr
     assert multiprocessing.active_children() == []

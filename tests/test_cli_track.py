@@ -263,7 +263,7 @@ def test_ctrl_c_leaves_what_is_done_and_resume_begins_the_drive_again(written, k
         patch.setattr(io.Sweep, "read_points", interrupted)
         patch.setattr(io.Sweep, "read_timed_points", interrupted)
         result = track(kitti, tmp_path, *LIGHT)
-    assert result.exit_code == 1
+    assert result.exit_code == 130
     assert "--resume goes on" in result.stderr
     done = records_of(tmp_path)
     assert 1 <= len(done) <= 3

@@ -137,7 +137,7 @@ def test_interrupted_it_reports_the_trials_that_are_done(kitti_folder, tmp_path,
     interrupt_at(monkeypatch, 2)
     output = tmp_path / "tune"
     result = tune(kitti_folder, output, "--trials", 9)
-    assert result.exit_code == 1
+    assert result.exit_code == 130
     assert sorted(path.name for path in output.iterdir()) == FILES
     report = read_report(output)
     assert report["interrupted"]
@@ -150,7 +150,7 @@ def test_interrupted_it_reports_the_trials_that_are_done(kitti_folder, tmp_path,
 def test_interrupted_before_the_base_is_scored_it_writes_nothing(kitti_folder, tmp_path, monkeypatch):
     interrupt_at(monkeypatch, 0)
     result = tune(kitti_folder, tmp_path / "tune")
-    assert result.exit_code == 1
+    assert result.exit_code == 130
     assert "nothing to report" in result.stderr
     assert list((tmp_path / "tune").iterdir()) == []
 

@@ -341,7 +341,7 @@ def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_p
     with monkeypatch.context() as patch:
         patch.setattr(ray_engine, "_tell", _interrupt)
         result = run(*command)
-    assert result.exit_code == 1, result.output
+    assert result.exit_code == 130, result.output
     assert "--resume goes on" in result.stderr
     manifest = manifest_of(tmp_path)
     assert (manifest["finished"], manifest["interrupted"], len(manifest["partitions"])) == (False, True, 1)

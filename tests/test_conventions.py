@@ -18,7 +18,19 @@ PROJECT = ROOT.parent
 
 # Each layer may import those before it, and itself.
 LAYERS = [
-    {"_version", "_extras", "_files", "_padding", "_box", "_box_rows", "config", "types", "geometry", "xla"},
+    {
+        "_version",
+        "_extras",
+        "_files",
+        "_interrupts",
+        "_padding",
+        "_box",
+        "_box_rows",
+        "config",
+        "types",
+        "geometry",
+        "xla",
+    },
     {"stages"},
     {"detector"},
     {"tracking"},

@@ -202,7 +202,7 @@ def test_a_signal_while_results_are_written_comes_after_them(sweeps, tmp_path, m
     with monkeypatch.context() as patch, heard_ctrl_c():
         patch.setattr(parquet, "box_rows", interrupted)
         result = detect(sweeps, tmp_path)
-    assert result.exit_code == 1
+    assert result.exit_code == 130
     assert "interrupted; the same command with --resume goes on." in result.stderr
     assert parquet.finished_parquet(tmp_path / "detections.parquet") == {"0"}
     (first,) = records_of(tmp_path)

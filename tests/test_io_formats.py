@@ -137,14 +137,14 @@ def test_las_and_laz_are_scaled_and_map_coordinates_are_refused(tmp_path, name):
 
 
 @pytest.mark.parametrize("calibrated", [False, True])
-def test_argoverse_feather_is_moved_to_the_sensor_and_named_by_its_time(tmp_path, calibrated):
+def test_feather_is_moved_to_the_sensor_of_a_calibrated_log_and_named_by_its_time(tmp_path, calibrated):
     lidar = tmp_path / "log" / "sensors" / "lidar"
     lidar.mkdir(parents=True)
     columns = {"x": FINITE[:, 0], "y": FINITE[:, 1], "z": FINITE[:, 2]}
     columns = {name: values.astype(np.float16) for name, values in columns.items()}
     table = pa.table({**columns, "intensity": np.uint8([7, 9]), "laser_number": np.uint8([1, 2])})
     feather.write_feather(table, lidar / "315966265259836000.feather")
-    sensor = np.array([1.35, 0, 1.64])
+    sensor = np.zeros(3)
     if calibrated:
         sensor = np.array([1.25, 0.5, 2])
         (tmp_path / "log" / "calibration").mkdir()
@@ -156,7 +156,21 @@ def test_argoverse_feather_is_moved_to_the_sensor_and_named_by_its_time(tmp_path
         assert (sweep.name, sweep.timestamp_ns) == ("315966265259836000", 315966265259836000)
     xyz, intensity = sweep.read_points()
     np.testing.assert_allclose(xyz, FINITE - sensor, atol=1e-6)
+    np.testing.assert_allclose(sweep.read_timed_points().xyz, xyz)
     np.testing.assert_array_equal(intensity, [7, 9])
+
+
+@pytest.mark.parametrize("folder", ["", "a/b", "sensors/other"])
+def test_a_table_that_is_no_sweep_of_a_log_is_taken_as_it_is_whatever_lies_near_it(tmp_path, folder):
+    (tmp_path / "calibration").mkdir()
+    place = {name: [1.25] for name in ("tx_m", "ty_m", "tz_m")}
+    table = pa.table({"sensor_name": ["up_lidar"], **place})
+    feather.write_feather(table, tmp_path / "calibration" / "egovehicle_SE3_sensor.feather")
+    (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+    columns = dict(zip("xyz", FINITE.T, strict=True))
+    feather.write_feather(pa.table(columns), tmp_path / folder / "a.feather")
+    np.testing.assert_array_equal(io.read_points(tmp_path / folder / "a.feather")[0], FINITE)
+    assert not io.read_timed_points(tmp_path / folder / "a.feather").is_compensated
 
 
 def test_the_real_pcd_is_the_binary_frame_and_a_spurious_point(data_root):

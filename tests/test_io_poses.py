@@ -802,6 +802,10 @@ def make_argoverse(root, T_city_ego, times, **columns):
     lidar.mkdir(parents=True)
     for time in times:
         (lidar / f"{time}.feather").write_bytes(b"")
+    (root / "log" / "calibration").mkdir()
+    place = {"tx_m": [1.35], "ty_m": [0.0], "tz_m": [1.64]}
+    calibration = root / "log" / "calibration" / "egovehicle_SE3_sensor.feather"
+    feather.write_feather(pa.table({"sensor_name": ["up_lidar"], **place}), calibration)
     quaternions = Rotation.from_matrix(T_city_ego[:, :3, :3]).as_quat(scalar_first=True)
     names = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
     values = np.column_stack([quaternions, T_city_ego[:, :3, 3]])

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from jaxbox._interrupts import interruptible
 from jaxbox._version import __version__
 from jaxbox.cli.config_options import chosen_config, chosen_preset
 from jaxbox.cli.console import cache_warnings, input_errors, stdout
@@ -83,7 +84,8 @@ app = typer.Typer(
 
 def main() -> None:
     """Runs the command line."""
-    app()
+    with interruptible():
+        app()
 
 
 def _show_version(wanted: bool) -> None:

@@ -2,9 +2,7 @@
 
 import contextlib
 import enum
-import signal
 import sys
-import threading
 import warnings
 from collections.abc import Iterator
 from typing import Any
@@ -15,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColum
 from rich.progress import TimeRemainingColumn as _TimeLeft
 from rich.text import Text
 
+from jaxbox._interrupts import EXIT_CODE
 from jaxbox.io import InputError
 from jaxbox.run.cache import CacheWarning
 
@@ -32,6 +31,18 @@ class ExitCode(enum.IntEnum):
     OK = 0
     FRAME_FAILED = 1
     BAD_INPUT = 2
+    INTERRUPTED = EXIT_CODE
+
+
+def exit_code(*, failed: bool, interrupted: bool) -> ExitCode:
+    """How a run over sweeps ended.
+
+    >>> exit_code(failed=True, interrupted=False)
+    <ExitCode.FRAME_FAILED: 1>
+    """
+    if interrupted:
+        return ExitCode.INTERRUPTED
+    return ExitCode.FRAME_FAILED if failed else ExitCode.OK
 
 
 def printable(text: str) -> str:
@@ -111,43 +122,6 @@ class _Rate(ProgressColumn):
     def render(self, task: Task) -> Text:
         """One number once there is one."""
         return Text("" if task.speed is None else f"{task.speed:.1f}/s")
-
-
-@contextlib.contextmanager
-def stoppable() -> Iterator[None]:
-    """Makes SIGTERM, by which schedulers end a job, the same as Ctrl-C: a KeyboardInterrupt."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-@contextlib.contextmanager
-def undisturbed() -> Iterator[None]:
-    """Puts Ctrl-C and SIGTERM off until a block has ended, so that what it writes belongs together.
-
-    Raises:
-      KeyboardInterrupt: after the block, where one of them came.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    came: list[int] = []
-    before = {
-        number: signal.signal(number, lambda number, _: came.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        if came:
-            raise KeyboardInterrupt
 
 
 def make_progress(*, shown: bool) -> Progress:

@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterator, Sequence
 from rich.progress import Progress
 
 from jaxbox import io
-from jaxbox.cli.console import ExitCode, make_progress, print_error, stderr, stdout, stoppable, undisturbed
+from jaxbox._interrupts import heard, stoppable, undisturbed
+from jaxbox.cli.console import ExitCode, exit_code, make_progress, print_error, stderr, stdout
 from jaxbox.cli.frames import Frame, FrameSource, FrameWork
 from jaxbox.cli.inputs import PICTURE_FOLDER, RunOptions, prepare_run, print_json, reasons_as_json
 from jaxbox.cli.report import (
@@ -45,7 +46,7 @@ def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
       options: the command's options.
 
     Returns:
-      `ExitCode.FRAME_FAILED` where a sweep failed, or it was interrupted.
+      `ExitCode.INTERRUPTED`, or `FRAME_FAILED` where a sweep failed.
 
     Raises:
       InputError: where a path holds no sweeps, or the options cannot be used.
@@ -72,7 +73,7 @@ def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
         repeated=reasons_as_json(run.repeated),
     )
     _report(run, results, options)
-    return ExitCode.FRAME_FAILED if run.failures or run.interrupted else ExitCode.OK
+    return exit_code(failed=bool(run.failures), interrupted=run.interrupted)
 
 
 def _run_sweeps(sweeps: Sequence[io.Sweep], options: DetectOptions, run: RunReport, results: Results) -> None:
@@ -89,6 +90,7 @@ def _run_sweeps(sweeps: Sequence[io.Sweep], options: DetectOptions, run: RunRepo
             run.failures.append(("the recording", str(error)))
             print_error(str(error))
         except KeyboardInterrupt:
+            heard()
             run.interrupted = True
         finally:
             # Where it was interrupted, the workers end now, and not with the last reference to them.

@@ -10,8 +10,8 @@ import typer
 from jaxbox.cli.config_options import complete_preset, complete_setting
 
 EXIT_CODES = (
-    "Exit codes: 0 all went well; 1 some sweeps failed or it was interrupted, the others are done; "
-    "2 the input or an option cannot be used, or results cannot be written."
+    "Exit codes: 0 all went well; 1 some sweeps failed, the others are done; 2 the input or an option cannot "
+    "be used, or results cannot be written; 130 it was interrupted, and what is done is whole."
 )
 
 

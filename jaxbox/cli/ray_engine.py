@@ -7,14 +7,8 @@ from typing import Any
 
 from rich.progress import Progress
 
-from jaxbox.cli.console import (
-    ExitCode,
-    make_progress,
-    print_error,
-    stderr,
-    stdout,
-    stoppable,
-)
+from jaxbox._interrupts import stoppable
+from jaxbox.cli.console import ExitCode, exit_code, make_progress, print_error, stderr, stdout
 from jaxbox.cluster import ClusterError, DatasetReport, DriveReport, PartitionReport
 from jaxbox.config import DetectorConfig
 from jaxbox.io import InputError
@@ -115,7 +109,7 @@ def run_on_ray(options: RayOptions, start: Callable[[OnReport], DatasetReport[An
       start: does it.
 
     Returns:
-      `ExitCode.FRAME_FAILED` where a sweep failed, it was interrupted, or Ray gave up.
+      `ExitCode.INTERRUPTED`, or `FRAME_FAILED` where a sweep failed or Ray gave up.
 
     Raises:
       InputError: where there are no sweeps, or the options cannot be used.
@@ -129,7 +123,7 @@ def run_on_ray(options: RayOptions, start: Callable[[OnReport], DatasetReport[An
         print_error(f"{error} The partitions that are done stay; the same command with --resume goes on.")
         return ExitCode.FRAME_FAILED
     _tell_end(report, options)
-    return ExitCode.FRAME_FAILED if report.failures or report.interrupted else ExitCode.OK
+    return exit_code(failed=bool(report.failures), interrupted=report.interrupted)
 
 
 def _teller(options: RayOptions, progress: Progress) -> OnReport:

@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 
 from jaxbox import io
+from jaxbox._interrupts import heard, stoppable, undisturbed
 from jaxbox.cli.console import (
     ExitCode,
+    exit_code,
     make_progress,
     print_error,
     print_warning,
     stderr,
     stdout,
-    stoppable,
-    undisturbed,
 )
 from jaxbox.cli.inputs import RunOptions, prepare_run, print_json, reasons_as_json
 from jaxbox.cli.kept import KeptSweep
@@ -93,7 +93,7 @@ def run_track(paths: Sequence[str], options: TrackOptions) -> ExitCode:
       options: the command's options.
 
     Returns:
-      `ExitCode.FRAME_FAILED` where a sweep failed, or it was interrupted.
+      `ExitCode.INTERRUPTED`, or `FRAME_FAILED` where a sweep failed.
 
     Raises:
       InputError: where a path holds no sweeps, or the options cannot be used.
@@ -123,7 +123,7 @@ def run_track(paths: Sequence[str], options: TrackOptions) -> ExitCode:
             if report.interrupted:
                 break
     _describe_run(run, options, time.perf_counter() - start)
-    return ExitCode.FRAME_FAILED if run.failures or run.interrupted else ExitCode.OK
+    return exit_code(failed=bool(run.failures), interrupted=run.interrupted)
 
 
 def _is_finished(
@@ -197,6 +197,7 @@ class _Drive:
         except io.InputError as error:
             _fail(self._report, self._report.name, str(error))
         except KeyboardInterrupt:
+            heard()
             self._report.interrupted = True
         finally:
             source.close()

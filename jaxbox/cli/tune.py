@@ -10,6 +10,7 @@ from typing import Any
 from rich.console import Console
 
 from jaxbox import tuning
+from jaxbox._interrupts import heard
 from jaxbox.cli.console import ExitCode, make_progress, print_error
 from jaxbox.cli.report import make_table
 from jaxbox.config import DetectorConfig
@@ -58,7 +59,7 @@ def run_tune(labels: pathlib.Path, options: TuneOptions, console: Console) -> Ex
       console: where results go.
 
     Returns:
-      `ExitCode.FRAME_FAILED` where it was interrupted.
+      `ExitCode.INTERRUPTED` where it was interrupted.
 
     Raises:
       InputError: where labels or options cannot be used.
@@ -83,10 +84,11 @@ def run_tune(labels: pathlib.Path, options: TuneOptions, console: Console) -> Ex
                     f"best {best.mean:.2f}, trial {best.index}"
                 )
         except KeyboardInterrupt:
+            heard()
             interrupted = True
     if not trials:
         print_error("interrupted before the base was scored; there is nothing to report.")
-        return ExitCode.FRAME_FAILED
+        return ExitCode.INTERRUPTED
     report = tuning.make_report(bench, axes, trials) | {
         "interrupted": interrupted,
         "num_planned": options.trials,
@@ -98,7 +100,7 @@ def run_tune(labels: pathlib.Path, options: TuneOptions, console: Console) -> Ex
         "num_compilations": count_compilations() - compiled_before,
     }
     write_report(report, options, console)
-    return ExitCode.FRAME_FAILED if interrupted else ExitCode.OK
+    return ExitCode.INTERRUPTED if interrupted else ExitCode.OK
 
 
 def chosen_axes(options: TuneOptions) -> list[Axis]:

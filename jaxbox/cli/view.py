@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from jaxbox import io
-from jaxbox.cli.console import ExitCode, stderr, stoppable
+from jaxbox._interrupts import heard, stoppable
+from jaxbox.cli.console import ExitCode, stderr
 from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
 from jaxbox.config import DetectorConfig
 from jaxbox.viewer import View, Wanted, open_viewer
@@ -70,6 +71,7 @@ def run_view(paths: Sequence[str], options: ViewOptions, console: Console) -> Ex
             with stoppable():
                 viewer.run()
         except KeyboardInterrupt:
+            heard()
             stderr().print("stopped")
     return ExitCode.OK
 

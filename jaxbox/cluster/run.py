@@ -15,6 +15,7 @@ from typing import Any, Generic
 
 from jaxbox import io
 from jaxbox._extras import require
+from jaxbox._interrupts import heard
 from jaxbox.cluster.reports import AnyReport, DatasetReport
 from jaxbox.cluster.sources import SweepRef, list_sweeps
 from jaxbox.cluster.store import Store
@@ -178,6 +179,7 @@ class Run(Generic[AnyReport]):
                     if on_report is not None:
                         on_report(done, len(missing))
         except KeyboardInterrupt:
+            heard()
             report.interrupted = True
         finally:
             report.partitions = [reports[p.name] for p in partitions if p.name in reports]

@@ -52,6 +52,8 @@ _SIZE = ("length_m", "width_m", "height_m")
 _ROTATION = ("qw", "qx", "qy", "qz")
 _MIN_NORM = 0.5
 _COLUMNS = ("x", "y", "z", "intensity")
+_OFFSET = "offset_ns"
+"""The data set's own name for the time of a point."""
 
 
 def read_argoverse2_points(
@@ -75,13 +77,14 @@ def read_argoverse2_points(
 
 
 def read_feather(path: str | os.PathLike[str]) -> Points:
-    """Reads a sweep of the data set as it comes, ``sensors/lidar/*.feather``, and moves it to the sensor.
+    """Reads a Feather table of points, and moves a sweep of a calibrated log to the sensor.
 
-    The upper LiDAR's place is taken from the log's ``calibration/egovehicle_SE3_sensor.feather``, or is
-    `SENSOR_XYZ_M` where there is none.
+    A sweep of the data set as it comes, ``LOG/sensors/lidar/*.feather``, is in the vehicle's frame; the upper
+    LiDAR's place is taken from ``LOG/calibration/egovehicle_SE3_sensor.feather``. Any other table, or one
+    whose log has no calibration, is taken as it is.
 
     Args:
-      path: a Feather table with x, y and z in the vehicle's frame.
+      path: a Feather table with x, y and z.
 
     Returns:
       As `jaxbox.io.read_points`.
@@ -95,10 +98,11 @@ def read_feather(path: str | os.PathLike[str]) -> Points:
 
 
 def read_timed_feather(path: str | os.PathLike[str]) -> TimedPoints:
-    """Reads a sweep of the data set with the times of its points, which it has compensated for.
+    """Reads a Feather table as `read_feather`, with the times of its points.
 
     Args:
-      path: as `read_feather`; with a column ``offset_ns``, from the time in the file's name.
+      path: as `read_feather`; the data set's own tables have a column ``offset_ns``, from the time in the
+        file's name, and their points have been compensated for the motion.
 
     Returns:
       The points; "We have egomotion-compensated the lidar sensor data to the egovehicle reference timestamp"
@@ -108,27 +112,30 @@ def read_timed_feather(path: str | os.PathLike[str]) -> TimedPoints:
       InputError: as `read_feather`, and where the unit of the times is not clear.
       ImportError: without the extra ``arrow``.
     """
-    points = timed_points(read_table(path, (*_COLUMNS, *TIME_NAMES)), str(path))
+    columns = read_table(path, (*_COLUMNS, *TIME_NAMES))
+    points = timed_points(columns, str(path))
     xyz = seen_from(log_sensor_xyz_m(path), points.xyz)
-    return dataclasses.replace(points, xyz=xyz, is_compensated=True)
+    return dataclasses.replace(points, xyz=xyz, is_compensated=_OFFSET in columns)
 
 
 def log_sensor_xyz_m(path: str | os.PathLike[str]) -> np.ndarray:
-    """Where the upper LiDAR is in the vehicle's frame, of which points and boxes are seen from there.
+    """Where the upper LiDAR is in the frame of a table's points.
 
     Args:
-      path: a sweep, ``LOG/sensors/lidar/*.feather``.
+      path: a table, ``LOG/sensors/lidar/*.feather`` where it is a sweep of the data set.
 
     Returns:
-      (3,) float64, m: by the log's calibration, or `SENSOR_XYZ_M` where there is none.
+      (3,) float64, m: by the log's calibration, or the origin where the table is no sweep of a log with one.
 
     Raises:
       InputError: where there is a calibration that cannot be read.
       ImportError: without the extra ``arrow``.
     """
-    calibration = pathlib.Path(os.path.abspath(path)).parents[2:3]
-    file = calibration[0] / "calibration" / "egovehicle_SE3_sensor.feather" if calibration else None
-    return _sensor_xyz_m(file) if file is not None and file.is_file() else np.array(SENSOR_XYZ_M)
+    folder = pathlib.Path(os.path.abspath(path)).parent
+    if (folder.parent.name, folder.name) != ("sensors", "lidar"):
+        return np.zeros(3)
+    file = folder.parents[1] / "calibration" / "egovehicle_SE3_sensor.feather"
+    return _sensor_xyz_m(file) if file.is_file() else np.zeros(3)
 
 
 def _sensor_xyz_m(path: pathlib.Path) -> np.ndarray:
