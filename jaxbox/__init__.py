@@ -1,7 +1,9 @@
 """jaxbox: training-free LiDAR vehicle detection as one compiled JAX function."""
 
+# First: to import JAX takes a second, in which Ctrl-C is to be heard, too.
+from jaxbox._interrupts import release as _release  # isort: split
+
 from jaxbox._box import Box, Detection
-from jaxbox._interrupts import release as _release
 from jaxbox._version import __version__
 from jaxbox.config import DEFAULT_SCORE_THRESHOLD, DetectorConfig, TrackConfig, propose_capacities
 from jaxbox.run import serialization as _serialization  # noqa: F401 - jax.export learns the types below

@@ -2,6 +2,7 @@
 
 import json
 import os
+import pathlib
 import signal
 import subprocess
 import sys
@@ -121,6 +122,15 @@ def test_who_ignores_ctrl_c_goes_on_to_do_so():
     assert (code, out.strip()) == (0, "went on")
 
 
+def wait_for_import(process):
+    """Until a process imports NumPy, which jaxbox does after it has taken over Ctrl-C."""
+    maps, end = pathlib.Path(f"/proc/{process.pid}/maps"), time.monotonic() + SLOWEST_S
+    while "numpy" not in maps.read_text():
+        assert process.poll() is None
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
 def test_commands_interrupted_at_any_time_on_a_busy_machine_end_and_leave_whole_files(tmp_path):
     sweep = make_small_sweep(0)
     for folder in ("velodyne", "calib", "label_2"):
@@ -130,18 +140,20 @@ def test_commands_interrupted_at_any_time_on_a_busy_machine_end_and_leave_whole_
     for text in (tmp_path / "kitti" / "label_2" / "0.txt", tmp_path / "found" / "0.txt"):
         io.write_labels(text, [])
     score = ("eval", "--labels", tmp_path / "kitti", "--results", tmp_path / "found", "--json")
-    # Later than Python itself has begun, and all at once, so that they keep each other waiting: seconds and
-    # command, whose output follows.
+    # Seconds after jaxbox has begun, and command, whose output follows; all at once, so that they keep each
+    # other waiting.
     plan = [
-        *((after_s, ("export", "--output")) for after_s in (1.5, 2.0, 3.0, 5.0, 9.0)),
-        *((after_s, score) for after_s in (1.5, 3.0)),
+        *((after_s, ("export", "--output")) for after_s in (0.0, 0.5, 1.5, 3.5, 7.5)),
+        *((after_s, score) for after_s in (0.0, 1.5)),
         (6.0, ("detect", tmp_path / "kitti", "--output")),
     ]
-    begun = time.monotonic()
     running = [
         (after_s, start("-m", "jaxbox", *command, tmp_path / f"out{index}"))
         for index, (after_s, command) in enumerate(plan)
     ]
+    for _, process in running:
+        wait_for_import(process)
+    begun = time.monotonic()
     for after_s, process in sorted(running, key=lambda pair: pair[0]):
         time.sleep(max(0.0, begun + after_s - time.monotonic()))
         process.send_signal(signal.SIGINT)
