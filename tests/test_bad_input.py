@@ -54,10 +54,10 @@ def test_the_ground_may_be_as_high_as_the_origin_but_not_above_it(preset):
 
 
 FRAMES = {
-    "another axis up: y": (lambda xyz: xyz[:, [1, 2, 0]], Status.NO_GROUND),
-    "another axis up: x": (lambda xyz: xyz[:, [2, 1, 0]] * [1, 1, -1], Status.NO_GROUND),
     # A facade is as good a plane as a road.
-    "a camera's": (lambda xyz: xyz[:, [1, 2, 0]] * [-1, -1, 1], Status.OK),
+    "another axis up: y": (lambda xyz: xyz[:, [1, 2, 0]], Status.OK),
+    "another axis up: x": (lambda xyz: xyz[:, [2, 1, 0]] * [1, 1, -1], Status.NO_GROUND),
+    "a camera's": (lambda xyz: xyz[:, [1, 2, 0]] * [-1, -1, 1], Status.NO_GROUND),
     "upside down": (lambda xyz: xyz * [1, -1, -1], Status.GROUND_ABOVE),
     "millimetres": (lambda xyz: xyz * 1000, Status.EMPTY | Status.NO_GROUND),
     "a map's": (lambda xyz: np.add(xyz, [1000, 500, 100]), Status.EMPTY | Status.NO_GROUND),
