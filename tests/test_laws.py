@@ -348,8 +348,9 @@ def configurations(draw):
     """Any preset with every threshold moved, and some of what is static."""
     config = DetectorConfig.presets()[draw(st.sampled_from(sorted(DetectorConfig.presets())))]
     values, structure = jax.tree.flatten(config)
-    moved = draw(st.lists(finite(-1e6, 1e6), min_size=len(values), max_size=len(values)))
-    return jax.tree.unflatten(structure, moved)
+    # Smaller, which no range forbids: a file with a number outside is refused.
+    shares = draw(st.lists(finite(0.01, 1), min_size=len(values), max_size=len(values)))
+    return jax.tree.unflatten(structure, [share * value for share, value in zip(shares, values, strict=True)])
 
 
 @given(configurations(), st.sampled_from(sorted(DetectorConfig.presets())))
