@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxbox.config import Label
+from jaxbox.geometry.rigid import rotation_about_z
 
 _SIGNS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]], np.float64)
 """Front left, rear left, rear right, front right."""
@@ -29,6 +30,41 @@ def _equal(a: Any, b: Any) -> bool:
         fields = (field.name for field in dataclasses.fields(a) if field.compare)
         return all(_equal(getattr(a, name), getattr(b, name)) for name in fields)
     return np.array_equal(a, b)
+
+
+def footprints(center: np.ndarray, size: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+    """Corners of upright boxes from above.
+
+    Args:
+      center: (K, 2 or more) m.
+      size: (K, 2 or more) m: length along the yaw, width.
+      yaw: (K,) rad, from +x about +z.
+
+    Returns:
+      (K, 4, 2) float64, m: counter-clockwise from front left.
+    """
+    local = _SIGNS * size[:, None, :2] / 2
+    cos, sin = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+    x, y = local[..., 0], local[..., 1]
+    return center[:, None, :2] + np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+
+def box_corners(center: np.ndarray, size: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+    """Corners of upright boxes.
+
+    Args:
+      center: (K, 3) m.
+      size: (K, 3) m: length along the yaw, width, height.
+      yaw: (K,) rad, from +x about +z.
+
+    Returns:
+      (K, 8, 3) float64, m: the `footprints` on the floor, then on the roof.
+    """
+    flat, half = footprints(center, size, yaw), size[:, None, 2:].astype(np.float64) / 2
+    levels = [center[:, None, 2:] + sign * half for sign in (-1, 1)]
+    return np.concatenate(
+        [np.concatenate([flat, np.broadcast_to(z, (len(flat), 4, 1))], axis=-1) for z in levels], axis=1
+    )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -81,14 +117,12 @@ class Box(ByValue):
     @property
     def footprint(self) -> np.ndarray:
         """(4, 2) float64, m: corners from above, counter-clockwise from front left."""
-        cos, sin = math.cos(self.heading), math.sin(self.heading)
-        return self.center[:2] + (_SIGNS * self.size[:2] / 2) @ np.array([[cos, sin], [-sin, cos]])
+        return footprints(self.center[None], self.size[None], np.array([self.heading]))[0]
 
     @property
     def corners(self) -> np.ndarray:
         """(8, 3) float64, m: the `footprint` on the floor, then on the roof."""
-        levels = self.center[2] + self.size[2] * np.array([-0.5, 0.5])
-        return np.column_stack([np.tile(self.footprint, (2, 1)), np.repeat(levels, len(_SIGNS))])
+        return box_corners(self.center[None], self.size[None], np.array([self.heading]))[0]
 
     def contains(self, xyz: np.ndarray) -> np.ndarray:
         """Which points are inside.
@@ -100,9 +134,7 @@ class Box(ByValue):
           (n,) bool; ``xyz[box.contains(xyz)]`` are the points. NaN is outside.
         """
         offset = np.asarray(xyz)[:, :3].astype(np.float64) - self.center
-        cos, sin = math.cos(self.heading), math.sin(self.heading)
-        # The rows are the box's own axes.
-        local = offset @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]).T
+        local = offset @ rotation_about_z(self.heading)
         return np.all(np.abs(local) <= self.size / 2, axis=1)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from jaxbox._box import Box, ByValue
 from jaxbox._extras import require
 from jaxbox.config import Label, RegionConfig
+from jaxbox.geometry.rigid import rotation_about_z
 
 AnyBox = TypeVar("AnyBox", bound=Box)
 
@@ -45,6 +46,18 @@ class BoxRows(ByValue, Generic[AnyBox]):
     def _box_at(self, row: int) -> AnyBox:
         """The box of a row, which is valid, of a sweep on the host."""
         raise NotImplementedError
+
+    def _fields_of_box(self, row: int) -> dict[str, Any]:
+        """What `Box` has, of a row of a sweep on the host."""
+        return {
+            "label": Label(self.label[row]),
+            "score": float(self.score[row]),
+            "center": np.asarray(self.center[row]),
+            "size": np.asarray(self.size[row]),
+            "yaw": float(self.yaw[row]),
+            "heading": float(self.heading[row]),
+            "front_probability": float(self.front_probability[row]),
+        }
 
     def _title(self) -> str:
         """What there is, in a line, of a sweep on the host."""
@@ -202,7 +215,7 @@ class BoxRows(ByValue, Generic[AnyBox]):
         geometry = require("open3d", extra="open3d", what="Its boxes").geometry
         return [
             geometry.OrientedBoundingBox(
-                box.center.astype(np.float64), _about_z(box.heading), box.size.astype(np.float64)
+                box.center.astype(np.float64), rotation_about_z(box.heading), box.size.astype(np.float64)
             )
             for box in self
         ]
@@ -295,8 +308,3 @@ def _in_polygon(center: np.ndarray, polygon: Any) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         at = x0 + (y - y0) / (y1 - y0) * (x1 - x0)
     return np.count_nonzero(crosses & (x < at), axis=1) % 2 == 1
-
-
-def _about_z(angle: float) -> np.ndarray:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])

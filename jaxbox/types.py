@@ -384,13 +384,7 @@ class Detections(BoxRows[Detection]):
         """The box of a row, which is valid, of a sweep on the host."""
         hull = np.asarray(self.hulls.vertices[row])
         return Detection(
-            label=Label(self.label[row]),
-            score=float(self.score[row]),
-            center=np.asarray(self.center[row]),
-            size=np.asarray(self.size[row]),
-            yaw=float(self.yaw[row]),
-            heading=float(self.heading[row]),
-            front_probability=float(self.front_probability[row]),
+            **self._fields_of_box(row),
             num_points=int(self.num_points[row]),
             hull=hull[: min(int(self.hulls.num_vertices[row]), len(hull))],
             point_detection=np.asarray(self.point_detection),

@@ -123,7 +123,7 @@ def test_a_full_disk_ends_the_run_with_the_mend_and_leaves_no_file(sweeps, tmp_p
 
 LIMITED = """
 import resource, sys
-from jaxbox.cli import main
+from jaxbox.__main__ import main
 # Beyond this no file can grow: the same to a program as a disk or quota that is full.
 import signal
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)

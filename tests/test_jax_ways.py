@@ -51,13 +51,13 @@ def avals_in(jaxpr):
                 yield from avals_in(part)
 
 
-@pytest.mark.parametrize(("preset", "wide"), [("default", False), ("paper", True)])
+@pytest.mark.parametrize("wide", [False, True])
+@pytest.mark.parametrize("preset", ["default", "paper"])
 def test_with_64_bits_enabled_the_bits_are_those_without(preset, wide):
     config, cloud = DetectorConfig.presets()[preset], street()
     expected = jax.device_get(detect(cloud, config))
     with enable_x64(True):
         if wide:
-            # All that is done to them first, whatever the preset, is to round them to 32 bits.
             cloud = jax.tree.map(lambda a: jnp.asarray(a, a.dtype.kind + "8"), cloud)
             assert cloud.xyz1.dtype == jnp.float64
             config = jax.tree.map(jnp.float64, config)

@@ -40,7 +40,7 @@ except PermissionError as error:
 else:
     raise SystemExit("the guard does not guard")
 """
-COMMAND = "from jaxbox.cli import main\nsys.argv = ['jaxbox', *sys.argv[1:]]\nmain()\n"
+COMMAND = "from jaxbox.__main__ import main\nsys.argv = ['jaxbox', *sys.argv[1:]]\nmain()\n"
 
 
 def run_guarded(code, *arguments):

@@ -1,5 +1,5 @@
 """The command line: ``jaxbox demo``, ``detect``, ``eval``, ``tune``, ``export`` and ``info``."""
 
-from jaxbox.cli.app import app, main
+from jaxbox.cli.app import app
 
-__all__ = ["app", "main"]
+__all__ = ["app"]

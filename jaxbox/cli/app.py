@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-from jaxbox._interrupts import interruptible
 from jaxbox._version import __version__
 from jaxbox.cli.config_options import chosen_config, chosen_preset
 from jaxbox.cli.console import cache_warnings, input_errors, stdout
@@ -80,12 +79,6 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-
-
-def main() -> None:
-    """Runs the command line."""
-    with interruptible():
-        app()
 
 
 def _show_version(wanted: bool) -> None:

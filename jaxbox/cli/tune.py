@@ -11,7 +11,7 @@ from rich.console import Console
 
 from jaxbox import tuning
 from jaxbox._interrupts import heard
-from jaxbox.cli.console import ExitCode, make_progress, print_error
+from jaxbox.cli.console import ExitCode, exit_code, make_progress, print_error
 from jaxbox.cli.report import make_table
 from jaxbox.config import DetectorConfig
 from jaxbox.config.fields import PRESET_KEY, changed_fields
@@ -100,7 +100,7 @@ def run_tune(labels: pathlib.Path, options: TuneOptions, console: Console) -> Ex
         "num_compilations": count_compilations() - compiled_before,
     }
     write_report(report, options, console)
-    return ExitCode.INTERRUPTED if interrupted else ExitCode.OK
+    return exit_code(failed=False, interrupted=interrupted)
 
 
 def chosen_axes(options: TuneOptions) -> list[Axis]:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation.matching import count_points_in_boxes
 from jaxbox.geometry.planar import wrap_turn, wrap_yaw
+from jaxbox.geometry.rigid import rotation_about_z
 from jaxbox.io import KittiObject, Sweep, boxes_from_objects, objects_from_detections
 from jaxbox.run.compiled import detect
 from jaxbox.types import Calibration, Detections, PointCloud, Status
@@ -90,7 +91,7 @@ def turn_points(xyz: np.ndarray, copy: Copy) -> np.ndarray:
     [[2.0, 1.0, 3.0]]
     """
     mirror = np.array([1.0, -1.0 if copy.mirrored else 1.0, 1.0])
-    return ((xyz * mirror) @ _rotation(copy.turn_deg).T).astype(np.float32)
+    return ((xyz * mirror) @ rotation_about_z(np.radians(copy.turn_deg)).T).astype(np.float32)
 
 
 def turn_back(detections: Detections, copy: Copy) -> Detections:
@@ -103,7 +104,7 @@ def turn_back(detections: Detections, copy: Copy) -> Detections:
     Returns:
       The detections with another centre, yaw and heading.
     """
-    center = np.asarray(detections.center, np.float64) @ _rotation(copy.turn_deg)
+    center = np.asarray(detections.center, np.float64) @ rotation_about_z(np.radians(copy.turn_deg))
     if copy.mirrored:
         center = center * [1, -1, 1]
 
@@ -117,11 +118,6 @@ def turn_back(detections: Detections, copy: Copy) -> Detections:
         yaw=wrap_yaw(back(detections.yaw)),
         heading=wrap_turn(back(detections.heading)),
     )
-
-
-def _rotation(turn_deg: float) -> np.ndarray:
-    cos, sin = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
-    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
 
 
 def detect_copy(

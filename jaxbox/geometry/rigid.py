@@ -14,6 +14,22 @@ _SMALL_ANGLE = 1e-9
 """rad: below it a motion turns points by less than a micrometre, and has no axis."""
 
 
+def rotation_about_z(angle: float) -> np.ndarray:
+    """The rotation that turns +x towards +y.
+
+    Args:
+      angle: rad.
+
+    Returns:
+      (3, 3) float64.
+
+    >>> (rotation_about_z(np.pi / 2) @ [1, 0, 0]).round(3).tolist()
+    [0.0, 1.0, 0.0]
+    """
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]])
+
+
 def inverse_rigid(T_a_b: np.ndarray) -> np.ndarray:
     """Inverts rigid transforms: T^-1 = [[R^T, -R^T t], [0, 1]].
 

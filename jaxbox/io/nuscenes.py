@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxbox.geometry.rigid import quaternion_of
+from jaxbox.geometry.rigid import quaternion_of, rotation_about_z
 from jaxbox.io.points import PointFormat, Points, read_float_rows
 from jaxbox.tracking.tracks import Track, Tracks
 from jaxbox.types import Detections
@@ -59,7 +59,6 @@ def boxes_to_nuscenes(
     kind = "tracking" if isinstance(boxes, Tracks) else "detection"
     results = []
     for box in boxes:
-        cos, sin = np.cos(box.heading), np.sin(box.heading)
         length, width, height = box.size.tolist()
         velocity = [*getattr(box, "velocity", (np.nan, np.nan)), 0.0]
         results.append(
@@ -67,7 +66,7 @@ def boxes_to_nuscenes(
                 "sample_token": sample_token,
                 "translation": (T[:3, :3] @ box.center + T[:3, 3]).tolist(),
                 "size": [width, length, height],
-                "rotation": quaternion_of(T[:3, :3] @ [[cos, -sin, 0], [sin, cos, 0], [0, 0, 1]]).tolist(),
+                "rotation": quaternion_of(T[:3, :3] @ rotation_about_z(box.heading)).tolist(),
                 "velocity": (T[:3, :3] @ velocity)[:2].tolist(),
                 f"{kind}_name": _OTHER_NAMES.get(box.label.word, box.label.word),
                 f"{kind}_score": box.score,

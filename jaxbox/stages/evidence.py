@@ -1,6 +1,5 @@
 """What the beams say about a box: hit, seen through or hidden, on a polar grid."""
 
-import functools
 import math
 
 import chex
@@ -8,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.config import EvidenceConfig
+from jaxbox.stages._grids import sum_of_neighbours
 from jaxbox.stages.state import Boxes, Evidence, FlatBoxes, Ground, RayFractions, Sweep
 from jaxbox.xla import chunks
 from jaxbox.xla.arithmetic import arctan2, cos_sin
@@ -165,10 +165,7 @@ def _ground_support(
     place = jnp.where(on_ground, i * n + j, n * n)
     count = jnp.zeros(n * n, jnp.int32).at[place].add(1, mode="drop").reshape(n, n)
     for axis in (0, 1):
-        pad = [(SUPPORT_REACH, SUPPORT_REACH) if a == axis else (0, 0) for a in (0, 1)]
-        padded = jnp.pad(count, pad)
-        slices = (jax.lax.slice_in_dim(padded, k, k + n, axis=axis) for k in range(2 * SUPPORT_REACH + 1))
-        count = functools.reduce(jnp.add, slices)
+        count = sum_of_neighbours(count, axis, SUPPORT_REACH)
     return count.astype(jnp.float32)
 
 

@@ -12,6 +12,7 @@ from jaxbox.config import DetectorConfig, GroundConfig
 from jaxbox.config.capacities import obstacle_capacity
 from jaxbox.config.schema import GROUND_CANDIDATE_CELL_M
 from jaxbox.geometry.planar import plane_residual
+from jaxbox.stages._grids import sum_of_neighbours
 from jaxbox.stages.state import Ground, Obstacles, Sweep
 from jaxbox.types import GroundPlane
 from jaxbox.xla import chunks
@@ -47,6 +48,10 @@ GAUSSIAN_TRUNCATION = 3.0
 
 SUPPORT_SQUARE_M = 2.0
 """Edge of the squares in which points support each other as ground."""
+
+
+SUPPORT_REACH = 1
+"""Squares on either side whose points count, too: 3 x 3."""
 
 
 SUPPORT_LEVELS_PER_M = 10.0
@@ -207,7 +212,9 @@ def least_supported(
     place = (jnp.clip(level, 0, num_levels - 1) * num_rows + row) * num_columns + column
     num_places = num_levels * num_rows * num_columns
     count = jnp.zeros(num_places, jnp.int32).at[jnp.where(mask, place, num_places)].add(1, mode="drop")
-    count = _sum_of_neighbours(_sum_of_neighbours(count.reshape(num_levels, *shape), 1), 2)
+    count = count.reshape(num_levels, *shape)
+    for axis in (1, 2):
+        count = sum_of_neighbours(count, axis, SUPPORT_REACH)
     about = count.astype(jnp.float32)
     about = about + _from_level(about, 1)
     four = about + _from_level(about, 2)
@@ -222,13 +229,6 @@ def least_supported(
 def _from_level(count: jax.Array, level: int) -> jax.Array:
     """The counts of so many levels higher; none beyond the last."""
     return jnp.pad(count[level:], ((0, level), (0, 0), (0, 0)))
-
-
-def _sum_of_neighbours(count: jax.Array, axis: int) -> jax.Array:
-    """Each with the ones before and after it along an axis."""
-    n = count.shape[axis]
-    padded = jnp.pad(count, [(1, 1) if a == axis else (0, 0) for a in range(count.ndim)])
-    return functools.reduce(jnp.add, (jax.lax.slice_in_dim(padded, k, k + n, axis=axis) for k in range(3)))
 
 
 def spread_points(

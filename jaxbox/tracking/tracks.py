@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxbox._box import Box
 from jaxbox._box_rows import BoxRows, later_module
-from jaxbox.config.class_priors import Label, classes_in_words
+from jaxbox.config.class_priors import classes_in_words
 from jaxbox.types import Calibration, Motion, to_host
 
 FREE = -1
@@ -223,13 +223,7 @@ class Tracks(BoxRows[Track]):
     def _box_at(self, row: int) -> Track:
         """The track of a slot, which is valid, of a sweep on the host."""
         return Track(
-            label=Label(self.label[row]),
-            score=float(self.score[row]),
-            center=np.asarray(self.center[row]),
-            size=np.asarray(self.size[row]),
-            yaw=float(self.yaw[row]),
-            heading=float(self.heading[row]),
-            front_probability=float(self.front_probability[row]),
+            **self._fields_of_box(row),
             id=int(self.id[row]),
             confirmed=bool(self.confirmed[row]),
             age=int(self.age[row]),

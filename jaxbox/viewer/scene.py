@@ -13,6 +13,7 @@ from jaxbox.viewer.motion import motion_lines, shown_groups
 from jaxbox.viewer.space import Caption, Lines, colored_edges, edges
 from jaxbox.viz import BoxGroup, BoxSet, color_by_height, color_by_id, draw_image_boxes
 from jaxbox.viz.colors import ESTIMATE, HULL, IGNORED, TRUTH, Color, shade_by_height
+from jaxbox.viz.stages import height_above_plane
 
 GROUND_COLOR: Color = (120, 100, 80)
 """Points of the ground."""
@@ -229,11 +230,11 @@ def _rows_of(frame: Frame, values: object) -> np.ndarray:
 
 def _height_above_ground(frame: Frame, detections: Detections | None) -> np.ndarray:
     """(n,) m above the plane, or above the lowest points where there is no answer yet."""
-    x, y, z = frame.xyz.astype(np.float64).T
+    xyz = frame.xyz.astype(np.float64)
     if detections is None:
+        z = xyz[:, 2]
         return z - (np.percentile(z, _LOW_PERCENTILE) if len(z) else 0)
-    a, b, c = np.asarray(detections.ground.coefficients, np.float64)
-    return z - (a * x + b * y + c)
+    return height_above_plane(xyz, detections)
 
 
 def _inside_any(xyz: np.ndarray, boxes: BoxSet) -> np.ndarray:

@@ -5,6 +5,7 @@ import dataclasses
 import cv2
 import numpy as np
 
+from jaxbox._box import box_corners, footprints
 from jaxbox.types import Detections, Label
 from jaxbox.viz.colors import Color
 
@@ -15,8 +16,6 @@ EDGES = np.array(
     [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)]
 )
 """Pairs of corners: floor, roof, uprights."""
-
-_SIGNS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]], np.float64)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -95,19 +94,11 @@ class BoxSet:
 
     def footprints(self) -> np.ndarray:
         """(K, 4, 2) float64, m: corners in the bird's-eye view, counter-clockwise from front left."""
-        local = _SIGNS * self.size[:, None, :2] / 2
-        cos, sin = np.cos(self.yaw)[:, None], np.sin(self.yaw)[:, None]
-        x, y = local[..., 0], local[..., 1]
-        return self.center[:, None, :2] + np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+        return footprints(self.center, self.size, self.yaw)
 
     def corners(self) -> np.ndarray:
         """(K, 8, 3) float64, m: the four corners of the floor, then of the roof."""
-        flat = self.footprints()
-        half = self.size[:, None, 2:] / 2
-        levels = [self.center[:, None, 2:] + sign * half for sign in (-1, 1)]
-        return np.concatenate(
-            [np.concatenate([flat, np.broadcast_to(z, (len(self), 4, 1))], axis=-1) for z in levels], axis=1
-        )
+        return box_corners(self.center, self.size, self.yaw)
 
     def segments(self) -> np.ndarray:
         """(K, 12, 2, 3) float64, m: the edges."""
