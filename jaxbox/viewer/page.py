@@ -10,7 +10,7 @@ from jaxbox.viewer.scene import COLORINGS, Scene
 from jaxbox.viewer.space import Caption
 from jaxbox.viewer.thresholds import THRESHOLDS, Threshold
 from jaxbox.viewer.viewer import Viewer, Wanted
-from jaxbox.viz.colors import BACKGROUND
+from jaxbox.viz.colors import BACKGROUND, in_linear_light
 
 GIVEN = "given"
 """Name of the settings of the command line in the list of presets."""
@@ -238,7 +238,8 @@ class ViserPage:
                 self._nodes[name] = self._server.scene.add_line_segments(
                     f"/{name}",
                     lines[name].segments,
-                    lines[name].end_colors,
+                    # Colours of the ends are not decoded there, as one colour of all lines is.
+                    in_linear_light(lines[name].end_colors),
                     thickness=LINE_PX,
                     thickness_units="screen",
                 )

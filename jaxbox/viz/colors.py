@@ -94,3 +94,22 @@ def _palette() -> np.ndarray:
     hue = (ids * GOLDEN_TURN) % 1.0 * 180
     hsv = np.stack([hue, 140 + (ids * 37) % 90, np.full(PALETTE_SIZE, 255)], axis=-1)
     return cv2.cvtColor(hsv.astype(np.uint8)[None], cv2.COLOR_HSV2RGB)[0]
+
+
+def in_linear_light(colors: np.ndarray) -> np.ndarray:
+    """Colours as renderers blend them: proportional to light, and not encoded for a screen.
+
+    Args:
+      colors: (..., 3) uint8, sRGB.
+
+    Returns:
+      (..., 3) uint8, linear.
+
+    Reference: IEC 61966-2-1, the sRGB transfer function.
+
+    >>> in_linear_light(np.array([255, 190, 40], np.uint8)).tolist()
+    [255, 131, 5]
+    """
+    share = np.asarray(colors, np.float64) / 255
+    linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return np.round(255 * linear).astype(np.uint8)
