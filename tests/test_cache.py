@@ -27,7 +27,7 @@ def _as_it_was(monkeypatch):
     monkeypatch.setattr(compiled, "_programs", None)
     users = jax.config.values["jax_compilation_cache_dir"]
     yield
-    jax.config.update("jax_compilation_cache_dir", users)
+    cache._move_jaxs(users)
 
 
 def modes(folder):
@@ -85,6 +85,7 @@ def test_a_folder_that_others_may_read_is_taken(tmp_path):
 
 def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
     owner = tmp_path.stat().st_uid
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path / "users"))
     monkeypatch.setattr(cache, "_ROOT", owner + 2)
     monkeypatch.setattr(os, "getuid", lambda: owner + 1)
     refused(tmp_path, "belongs to another user")
@@ -174,3 +175,78 @@ def test_processes_that_are_started_get_the_same_folders(tmp_path):
     (tmp_path / cache.PROGRAMS).chmod(0o777)
     folders.apply()
     assert compiled.kept_programs().folder is None
+
+
+DAMAGED = """
+import pathlib, shutil, sys, warnings
+import jax, jax.numpy as jnp
+import jaxbox
+from jaxbox.run.cache import CacheFolders
+warnings.simplefilter("error")
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+folder = pathlib.Path(sys.argv[1])
+jaxbox.enable_cache(folder)
+# What a worker of this process gets.
+CacheFolders.of_this_process().apply()
+hits = []
+jax.monitoring.register_event_listener(lambda name, **_: hits.append(name.endswith("/cache_hits")))
+
+x = jnp.arange(9.0)
+
+def is_found():
+    # Compiles anew, or takes the entry; the value is right in any case.
+    jax.clear_caches()
+    hits.clear()
+    assert jax.jit(lambda x: jnp.sort(x * 3) + 1)(x).tolist()[-1] == 25
+    return any(hits)
+
+def entry():
+    (path,) = folder.glob("jit__lambda-*-cache")
+    return path
+
+assert not is_found() and is_found()
+good = entry().read_bytes()
+flipped = [good[:at] + bytes([good[at] ^ 1]) + good[at + 1 :] for at in range(0, len(good), len(good) // 9)]
+for damage in (good[: len(good) // 2], b"", good + b"x", *flipped):
+    entry().write_bytes(damage)
+    assert not is_found(), "it was taken for a program"
+    assert entry().read_bytes() == good or is_found(), "another is kept in its place"
+# A good entry, of another program.
+jax.jit(lambda y: y - 7)(1.0).block_until_ready()
+other = next(path for path in folder.glob("jit__lambda-*-cache") if path.read_bytes() != good)
+mine = next(path for path in folder.glob("jit__lambda-*-cache") if path != other)
+shutil.copy(other, mine)
+other.unlink()
+assert not is_found()
+assert is_found()
+print("whole")
+"""
+
+
+def test_a_damaged_entry_of_jaxs_cache_or_one_under_anothers_name_is_made_again(tmp_path):
+    environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    environment["PYTHONPATH"] = str(PROJECT)
+    command = [sys.executable, "-c", DAMAGED, str(tmp_path / "cache")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "whole", done.stderr
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o775])
+def test_a_folder_of_jaxs_own_that_others_may_write_to_is_not_used(tmp_path, mode):
+    users = tmp_path / "users"
+    users.mkdir()
+    users.chmod(mode)
+    jax.config.update("jax_compilation_cache_dir", str(users))
+    with pytest.warns(CacheWarning, match=f"{users} .*JAX's compilation cache is off"):
+        jaxbox.enable_cache(tmp_path / "ours")
+    assert jax.config.values["jax_compilation_cache_dir"] is None
+    assert compiled.kept_programs().folder == tmp_path / "ours" / cache.PROGRAMS
+
+
+@pytest.mark.parametrize("place", ["missing", "gs://bucket/cache"])
+def test_a_folder_of_jaxs_own_that_is_not_there_or_is_a_url_is_left_to_jax(tmp_path, place):
+    folder = place if "://" in place else str(tmp_path / place)
+    jax.config.update("jax_compilation_cache_dir", folder)
+    jaxbox.enable_cache(tmp_path / "ours")
+    assert jax.config.values["jax_compilation_cache_dir"] == folder

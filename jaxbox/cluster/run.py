@@ -4,6 +4,8 @@ import concurrent.futures
 import contextlib
 import dataclasses
 import hashlib
+import importlib
+import ipaddress
 import json
 import logging
 import os
@@ -28,6 +30,8 @@ CONFIG = "config.toml"
 """The exact settings, next to its partitions."""
 _LOOKERS = 16
 """Threads that look at the partitions of an earlier run: each look waits for the file system."""
+CLUSTERS_VARIABLE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+"""Environment variable without which Ray takes the loopback address for its machine's, on any system."""
 _STORE_BYTES = 2**28
 """Of Ray's memory for objects, where it is started here: partitions travel as paths, not as points."""
 
@@ -83,13 +87,16 @@ def joined_ray(address: str | None, workers: int | None, cpus_per_worker: int) -
         joined = True
         # "local" starts one here, whatever address the environment names.
         options = {"address": address} if address else {"address": "local", **started_here}
+        place = contextlib.nullcontext() if address else _on_loopback(ray)
         try:
-            with warnings.catch_warnings():
+            with warnings.catch_warnings(), place:
                 # JAX warns of any fork; those of Ray replace the process immediately.
                 warnings.filterwarnings("ignore", r"os\.fork\(\)", RuntimeWarning)
                 ray.init(**options, log_to_driver=False, logging_level=logging.ERROR)
         except (RuntimeError, ConnectionError, ValueError) as error:
             raise ClusterError(f"Ray cannot be reached or started: {error}") from error
+        if not address:
+            _check_loopback(ray)
     context = data.DataContext.get_current()
     shown, context.enable_progress_bars = context.enable_progress_bars, False
     logger = logging.getLogger("ray.data")
@@ -101,6 +108,39 @@ def joined_ray(address: str | None, workers: int | None, cpus_per_worker: int) -
         logger.setLevel(level)
         if joined:
             ray.shutdown()
+
+
+@contextlib.contextmanager
+def _on_loopback(ray: Any) -> Iterator[None]:
+    """Has a Ray that is started in the block listen on the loopback interface, as it does on a Mac.
+
+    Its services ask nobody who is there: who reaches one runs code as this user. Their address depends on a
+    constant of Ray's, which each of its processes reads from the environment.
+    """
+    constants: Any = importlib.import_module("ray._private.ray_constants")
+    before = os.environ.get(CLUSTERS_VARIABLE), getattr(constants, "ENABLE_RAY_CLUSTER", None)
+    os.environ[CLUSTERS_VARIABLE] = "0"
+    constants.ENABLE_RAY_CLUSTER = False
+    try:
+        yield
+    finally:
+        constants.ENABLE_RAY_CLUSTER = before[1]
+        if before[0] is None:
+            del os.environ[CLUSTERS_VARIABLE]
+        else:
+            os.environ[CLUSTERS_VARIABLE] = before[0]
+
+
+def _check_loopback(ray: Any) -> None:
+    """Ends and refuses a Ray that was started here and is at another address than the loopback one."""
+    address = ray.util.get_node_ip_address()
+    if not ipaddress.ip_address(address).is_loopback:
+        ray.shutdown()
+        raise ClusterError(
+            f"Ray {ray.__version__} listens at {address}, where it can be reached from other machines, and "
+            "asks nobody who is there; install another version, or start one by `ray start --head` in a "
+            "network that you trust, and name it by --address auto."
+        )
 
 
 @dataclasses.dataclass
