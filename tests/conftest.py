@@ -60,8 +60,10 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update("jax_compilation_cache_dir", folder)
     # The user's own cache is left alone, also by the processes that tests start.
     os.environ["JAXBOX_CACHE_DIR"] = ""
-    # Two, so that work over several devices can be tested; the first is the default as ever.
+    # Two, so that work over several devices can be tested; the first is the default as ever. In the processes
+    # that tests start too, as programs are kept for so many devices.
     jax.config.update("jax_num_cpu_devices", 2)
+    os.environ["JAX_NUM_CPU_DEVICES"] = "2"
     # What a user may ask for, the library must do, and the tests with it.
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import tempfile
 
-import jax
 import numpy as np
 import pytest
 from test_cli import make_small_sweep, run, write_points
@@ -57,9 +56,8 @@ def faults(monkeypatch):
 
 
 def test_killed_and_resumed_a_run_ends_as_if_nothing_had_happened(tmp_path, faults, monkeypatch):
-    # Processes of their own, which share the compiled detector of these tests: its devices are in its key.
+    # Processes of their own, which share the compiled detector of these tests.
     monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "cache"))
-    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", str(jax.config.jax_num_cpu_devices))
     faults.write_sweeps(tmp_path / "sweeps", 2)
     report = faults.kill_and_resume(tmp_path / "sweeps", tmp_path, kills=3, seed=1)
     assert report["kills"] == 3
