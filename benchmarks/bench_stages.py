@@ -30,7 +30,7 @@ from benchmarks import common, in_turn
 from jaxbox import DetectorConfig, PointCloud, detector
 from jaxbox.io import Sweep
 from jaxbox.run import compiled
-from jaxbox.stages import clustering, evidence, filtering, ground
+from jaxbox.stages import clustering, filtering, ground
 
 MIN_SWEEPS, QUICK_SWEEPS = 80, 20
 """Different sweeps that a 99th percentile is taken over, at the least."""
@@ -129,7 +129,7 @@ def run_steps(cloud: PointCloud, config: DetectorConfig, run: Callable[..., Any]
     obstacles = run(ground.gather_obstacles, sweep, terrain, config)
     clusters = run(clustering.propose_clusters, obstacles, config)
     outlines, rotations = run(detector.fit_rectangles, obstacles, clusters, config)
-    seen = run(evidence.observe, sweep, terrain, config.evidence)
+    seen = run(detector.observe, sweep, terrain, config)
     segments = detector.Segments(sweep, terrain, obstacles, clusters, outlines, rotations, seen)
     completed = run(detector.complete_boxes, segments, config)
     candidates = run(detector.score_boxes, completed, segments, config)

@@ -104,8 +104,10 @@ def extents_along(hull: np.ndarray, yaw: float) -> np.ndarray:
 def free_space(xyz: np.ndarray, height: np.ndarray, detections: Detections) -> np.ndarray:
     """(h, w) bool: the pixels of `FRAME` through which some beam passed at the height of a car."""
     config = DetectorConfig().evidence
-    sensor_height_m = -float(detections.ground.coefficients[2])
-    evidence = reference.build_evidence(xyz, height, sensor_height_m, config)
+    plane = np.asarray(detections.ground.coefficients, float)
+    evidence = reference.build_evidence(
+        xyz, height, -plane[2], lambda xyz: reference.plane_elevation(xyz, plane), config
+    )
     is_free = np.diff(evidence.free_sums, axis=1) > 0
     rows, columns = np.indices(FRAME.shape) + 0.5
     x = FRAME.x_range_m[0] + columns / FRAME.px_per_m

@@ -30,6 +30,7 @@ from jaxbox.stages.state import (
     Completed,
     Evidence,
     Ground,
+    GroundElevation,
     Obstacles,
     Outlines,
     Rotations,
@@ -86,7 +87,7 @@ def segment(cloud: PointCloud, config: DetectorConfig, key: jax.Array) -> Segmen
     # 3.3, 3.4 Convex hull, and rectangles at all rotations (Algorithm III).
     outlines, rotations = outline(fit_rectangles, obstacles, clusters, config)
     # What the beams saw, for the correction.
-    seen = outline(evidence.observe, sweep, terrain, config.evidence)
+    seen = outline(observe, sweep, terrain, config)
     return Segments(sweep, terrain, obstacles, clusters, outlines, rotations, seen)
 
 
@@ -126,6 +127,25 @@ def fit_rectangles(
     return outlines, rectangles.fit_rectangles(outlines, clusters.num, config.box)
 
 
+def observe(sweep: Sweep, terrain: Ground, config: DetectorConfig) -> Evidence | None:
+    """What the beams saw.
+
+    Args:
+      sweep: of N rows.
+      terrain: below them.
+      config: of the detector.
+
+    Returns:
+      The evidence; None where the preset does not ask for it.
+    """
+    ground_elevation = elevation_of(terrain, config)
+
+    def elevation(xyz: jax.Array) -> jax.Array:
+        return outline(ground_elevation, xyz)
+
+    return evidence.observe(sweep, terrain, elevation, config.evidence)
+
+
 def complete_boxes(segments: Segments, config: DetectorConfig) -> Completed:
     """Completed boxes of all class hypotheses, along the scene's direction where the preset prefers it.
 
@@ -162,13 +182,26 @@ def score_boxes(completed: Completed, segments: Segments, config: DetectorConfig
     if seen is not None:
         num, num_rays = completed.hypotheses.num, config.completion.num_final_rays
         rays = evidence.weigh_boxes(seen, completed.boxes, num, config.evidence, num_rays=num_rays)
-    elevation = functools.partial(
-        ground.ground_elevation, planes=terrain.planes, surface=terrain.surface, config=config.ground
-    )
+    elevation = elevation_of(terrain, config)
     clusters, obstacles, lowest_z = segments.clusters, segments.obstacles, None
     if config.ground.max_planes > 1:
         lowest_z = clustering.lowest_z(segments.sweep.xyz[:, 2], obstacles, clusters)
     return scoring.score_boxes(completed, rays, clusters, obstacles, elevation, lowest_z, config)
+
+
+def elevation_of(terrain: Ground, config: DetectorConfig) -> GroundElevation:
+    """A function that knows the ground of one sweep.
+
+    Args:
+      terrain: of the sweep.
+      config: of the detector.
+
+    Returns:
+      z of the ground under points, see `jaxbox.stages.ground.ground_elevation`.
+    """
+    return functools.partial(
+        ground.ground_elevation, planes=terrain.planes, surface=terrain.surface, config=config.ground
+    )
 
 
 def assemble(

@@ -152,6 +152,9 @@ class Case:
         xyz = self.xyz[self.inlier].astype(float)
         return reference.fit_ground_surface(xyz, self.plane, CONFIG.ground).astype(np.float32)
 
+    def ground_elevation(self, xyz: np.ndarray) -> np.ndarray:
+        return reference.ground_elevation(xyz, self.plane, self.surface, CONFIG.ground)
+
     @functools.cached_property
     def height(self) -> np.ndarray:
         """(n,) float32, m, of all points, outliers too."""
@@ -189,7 +192,9 @@ class Case:
     @functools.cached_property
     def evidence(self) -> reference.Evidence:
         xyz, height = self.xyz[self.inlier].astype(float), self.height[self.inlier].astype(float)
-        return reference.build_evidence(xyz, height, -float(self.plane[2]), CONFIG.evidence)
+        return reference.build_evidence(
+            xyz, height, -float(self.plane[2]), self.ground_elevation, CONFIG.evidence
+        )
 
     def evidence_as_input(self) -> Evidence:
         """The reference's evidence in the layout of the compiled stages."""

@@ -11,16 +11,30 @@ import parity
 import pytest
 
 from jaxbox import reference
-from jaxbox.stages import _assignments, completion, evidence
+from jaxbox.stages import _assignments, completion, evidence, ground
 from jaxbox.stages.state import NOT_A_BOX, Boxes, ClassHypotheses, Rectangles
 from jaxbox.xla import range_bits
 
 EVIDENCE = parity.CONFIG.evidence
 NUM_RAYS = parity.CONFIG.completion.num_rays
 
-build_evidence = parity.PerForm(evidence.build_evidence)
 ground_support = jax.jit(evidence.ground_support)
 first_returns = jax.jit(evidence.first_returns)
+
+
+@parity.PerForm
+def build_evidence(xyz, height, mask, plane, surface):
+    elevation = functools.partial(
+        ground.ground_elevation, planes=plane[None], surface=surface, config=parity.CONFIG.ground
+    )
+    return evidence.build_evidence(xyz, height, mask, -plane[2], elevation, EVIDENCE)
+
+
+@parity.PerForm
+def weigh_boxes(seen, boxes, count):
+    length, width, yaw = boxes[:, 2:].T
+    flat = Boxes(boxes[:, :2], length, width, yaw, boxes[:, 2:4], length)
+    return evidence.weigh_boxes(seen, flat, count, EVIDENCE, num_rays=NUM_RAYS)
 
 
 @parity.PerForm
@@ -81,8 +95,8 @@ def test_evidence_differs_in_few_cells_only(cases):
             parity.pad(case.xyz, parity.CAPACITY),
             parity.pad(case.height, parity.CAPACITY),
             parity.pad(case.inlier, parity.CAPACITY),
-            -case.plane[2],
-            EVIDENCE,
+            case.plane,
+            case.surface,
         )
         hit, free = (range_bits.flagged_cells(np.asarray(words)) for words in (ours.hit, ours.free))
         hits, frees = (parity.flagged(sums).T for sums in (case.evidence.hit_sums, case.evidence.free_sums))
@@ -116,6 +130,20 @@ def test_ground_support_is_looked_up_where_the_reference_does(cases):
         xy = rng.uniform(-120, 120, (64, 2)).astype(np.float32)
         expected = reference.ground_support(case.evidence, xy.astype(float))
         np.testing.assert_array_equal(ground_support(case.evidence_as_input(), xy), expected)
+
+
+@pytest.mark.usefixtures("platform")
+def test_boxes_are_supported_where_the_reference_says(cases):
+    rng, num_boxes = np.random.default_rng(1), 512
+    for case in cases:
+        boxes = random_boxes(num_boxes, rng)
+        _, expected = reference.weigh_boxes(case.evidence, boxes.astype(float), num_rays=NUM_RAYS)
+        _, support = weigh_boxes(case.evidence_as_input(), boxes, num_boxes)
+        # A point of a box may round into the next cell of 1 m.
+        parity.assert_share(np.sum(np.asarray(support) != expected), num_boxes, 1e-2, "support")
+        of_center = reference.ground_support(case.evidence, boxes[:, :2].astype(float))
+        assert np.all(expected >= of_center)
+        assert np.any(expected > of_center)
 
 
 @pytest.mark.usefixtures("platform")

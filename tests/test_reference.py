@@ -408,9 +408,13 @@ def test_descriptors_of_a_filled_rectangle_are_those_of_the_textbook(yaw):
 # ---------------------------------------------------------------- evidence
 
 
+def even_ground(xyz):
+    return np.full(len(xyz), -SENSOR_HEIGHT_M)
+
+
 def test_one_beam_to_the_ground_frees_the_cells_where_it_is_between_the_heights():
     xyz = np.array([[20.1, 0.0, -SENSOR_HEIGHT_M]])
-    evidence = reference.build_evidence(xyz, np.zeros(1), SENSOR_HEIGHT_M, EVIDENCE)
+    evidence = reference.build_evidence(xyz, np.zeros(1), SENSOR_HEIGHT_M, even_ground, EVIDENCE)
     free = np.diff(evidence.free_sums, axis=1) > 0
     start, end = (20.1 * (SENSOR_HEIGHT_M - h) / SENSOR_HEIGHT_M for h in (0.8, 0.35))
     wholly = [k for k in range(320) if k * 0.25 >= start and (k + 1) * 0.25 <= end]
@@ -420,9 +424,20 @@ def test_one_beam_to_the_ground_frees_the_cells_where_it_is_between_the_heights(
     assert evidence.hit_sums.max() == 0
 
 
+def test_over_a_dip_a_beam_is_as_high_as_over_its_bottom():
+    # The road falls by 1 m between 10 and 20 m, where the beam would be between the heights, and rises again.
+    def dip(xyz):
+        return -SENSOR_HEIGHT_M - ((xyz[:, 0] > 10) & (xyz[:, 0] < 20))
+
+    xyz = np.array([[20.1, 0.0, -SENSOR_HEIGHT_M]])
+    for ground, is_free in ((even_ground, True), (dip, False)):
+        evidence = reference.build_evidence(xyz, np.zeros(1), SENSOR_HEIGHT_M, ground, EVIDENCE)
+        assert np.any(evidence.free_sums) == is_free
+
+
 def test_a_beam_that_ends_between_the_heights_is_free_up_to_the_gap_and_hits():
     xyz = np.array([[0.0, 12.6, -1.23]])
-    evidence = reference.build_evidence(xyz, np.array([0.5]), SENSOR_HEIGHT_M, EVIDENCE)
+    evidence = reference.build_evidence(xyz, np.array([0.5]), SENSOR_HEIGHT_M, even_ground, EVIDENCE)
     _, cells = np.nonzero(np.diff(evidence.free_sums, axis=1))
     assert cells.min() == int(12.6 * 0.93 / 1.23 / 0.25) + 1
     assert cells.max() == int((12.6 - 0.3) / 0.25) - 1
@@ -434,7 +449,7 @@ def wall_evidence():
     """A wall 10 m ahead, 4 m wide, with ground up to 40 m elsewhere."""
     xyz = lidar_sweep([(10.1, 0.0, 0.2, 4.0, 0.0, 3.0)], noise_m=0.0)
     height = xyz[:, 2] + SENSOR_HEIGHT_M
-    return reference.build_evidence(xyz, height, SENSOR_HEIGHT_M, EVIDENCE)
+    return reference.build_evidence(xyz, height, SENSOR_HEIGHT_M, even_ground, EVIDENCE)
 
 
 def test_boxes_at_before_and_behind_a_wall_and_in_the_open_are_hit_free_hidden_and_free():
@@ -460,7 +475,9 @@ def test_ray_shares_sum_to_one_and_a_mirrored_sweep_gives_mirrored_shares():
     shares = []
     for sign in (1, -1):
         height = xyz[:, 2] + SENSOR_HEIGHT_M
-        evidence = reference.build_evidence(xyz * [1, sign, 1], height, SENSOR_HEIGHT_M, EVIDENCE)
+        evidence = reference.build_evidence(
+            xyz * [1, sign, 1], height, SENSOR_HEIGHT_M, even_ground, EVIDENCE
+        )
         rays = reference.cast_rays(evidence, boxes * [1, sign, 1, 1, sign], num_rays=33)
         shares.append([rays.hit, rays.free, rays.occluded, rays.deep, rays.free_length])
     np.testing.assert_allclose(np.sum(shares[0][:4], axis=0), 1)
@@ -479,7 +496,7 @@ def test_the_share_of_hit_rays_is_the_share_of_the_span_that_holds_returns():
     faces = [rho * np.array([np.cos(azimuth), np.sin(azimuth)]) for rho in np.arange(9.5, 14.5, 0.1)]
     xy = np.concatenate(faces, axis=1).T
     xyz = np.column_stack([xy, np.full(len(xy), 0.6)])
-    evidence = reference.build_evidence(xyz, xyz[:, 2], 0.0, EVIDENCE)
+    evidence = reference.build_evidence(xyz, xyz[:, 2], 0.0, lambda xyz: np.zeros(len(xyz)), EVIDENCE)
     share = (span.max() - middle) / np.ptp(span)
     assert abs(share - 0.5) > 0.02
     rays = reference.cast_rays(evidence, box, num_rays=400)
@@ -502,7 +519,7 @@ def test_without_evidence_every_ray_counts_as_hit_and_the_ground_is_not_looked_a
 def test_ground_support_counts_the_seven_by_seven_cells_round_a_place():
     rng = np.random.default_rng(8)
     xyz = rng.uniform([-30, -30, -0.3], [30, 30, 0.3], (5000, 3))
-    evidence = reference.build_evidence(xyz, xyz[:, 2], SENSOR_HEIGHT_M, EVIDENCE)
+    evidence = reference.build_evidence(xyz, xyz[:, 2], SENSOR_HEIGHT_M, even_ground, EVIDENCE)
     for place in ([0.5, 0.5], [-12.3, 7.7], [29.0, -29.0]):
         low = np.floor(place) - 3
         inside = ((xyz[:, :2] >= low) & (xyz[:, :2] < low + 7)).all(axis=1) & (np.abs(xyz[:, 2]) < 0.15)
@@ -579,7 +596,7 @@ def test_a_cluster_larger_than_the_class_is_no_box():
 def test_evidence_turns_a_rear_face_into_a_car_that_points_away_from_the_sensor():
     xyz = lidar_sweep([(14.0, 2.0, 3.9, 1.6, 0.0, 1.5)], noise_m=0.0)
     height = xyz[:, 2] + SENSOR_HEIGHT_M
-    evidence = reference.build_evidence(xyz, height, SENSOR_HEIGHT_M, EVIDENCE)
+    evidence = reference.build_evidence(xyz, height, SENSOR_HEIGHT_M, even_ground, EVIDENCE)
     rear = xyz[(height > 0.2) & (height < 0.8) & (np.abs(xyz[:, 0] - 12.05) < 0.02), :2]
     completed = complete(rear, mode="evidence", evidence=evidence)
     np.testing.assert_allclose(completed.box[:2], [14.0, 2.0], atol=0.1)
@@ -590,7 +607,7 @@ def test_evidence_turns_a_rear_face_into_a_car_that_points_away_from_the_sensor(
 def test_the_chosen_hypothesis_has_the_objective_that_its_parts_add_up_to():
     xyz = lidar_sweep([(14.0, 2.0, 3.9, 1.2, 0.4, 1.5), (9.0, 2.9, 0.3, 1.0, 0.0, 1.0)])
     height = xyz[:, 2] + SENSOR_HEIGHT_M
-    evidence = reference.build_evidence(xyz, height, SENSOR_HEIGHT_M, EVIDENCE)
+    evidence = reference.build_evidence(xyz, height, SENSOR_HEIGHT_M, even_ground, EVIDENCE)
     xy = xyz[(height > 0.2) & (height < 0.8) & (xyz[:, 0] > 10), :2]
     curve, _ = reference.try_rotations(xy, BOX)
     weights = {"free_weight": 0.7, "free_length_weight": 3.0, "inside_weight": 0.4, "near_weight": 0.9}

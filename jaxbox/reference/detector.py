@@ -1,5 +1,7 @@
 """The whole pipeline: one sweep in, vehicle boxes out, each line a stage of `jaxbox.detector`."""
 
+import functools
+
 import numpy as np
 
 from jaxbox.config import DetectorConfig
@@ -50,7 +52,10 @@ def detect(
     outlines = hull.outline_clusters(obstacles, clusters, config)
     rotations = fitting.fit_rectangles(outlines, config.box)
     # Correction for occluded objects.
-    seen = evidence.observe(sweep, terrain, config.evidence)
+    elevation = functools.partial(
+        ground.ground_elevation, planes=terrain.planes, surface=terrain.surface, config=config.ground
+    )
+    seen = evidence.observe(sweep, terrain, elevation, config.evidence)
     preference = np.zeros(config.box.num_angles)
     if config.box.scene_direction and seen is not None:
         first = maps[0].clusters

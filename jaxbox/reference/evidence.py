@@ -1,5 +1,7 @@
 """What each beam says about a box: hit, seen through (free) or hidden."""
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy import ndimage
 
@@ -30,12 +32,19 @@ FREE_BEFORE_M = 0.2
 """up to this far before the exit."""
 
 
-def observe(sweep: Sweep, ground: Ground, config: EvidenceConfig) -> Evidence | None:
+GroundElevation = Callable[[np.ndarray], np.ndarray]
+"""z of the ground, (n,) m, under points (n, 3) m."""
+
+
+def observe(
+    sweep: Sweep, ground: Ground, ground_elevation: GroundElevation, config: EvidenceConfig
+) -> Evidence | None:
     """What the beams saw.
 
     Args:
       sweep: of n points.
       ground: below them.
+      ground_elevation: of the ground under other places.
       config: of the evidence.
 
     Returns:
@@ -44,21 +53,28 @@ def observe(sweep: Sweep, ground: Ground, config: EvidenceConfig) -> Evidence | 
     if not config.enabled:
         return None
     sensor_height_m = -float(ground.planes[0, 2])
-    return build_evidence(sweep.xyz[sweep.inlier], ground.height[sweep.inlier], sensor_height_m, config)
+    seen = sweep.xyz[sweep.inlier], ground.height[sweep.inlier]
+    return build_evidence(*seen, sensor_height_m, ground_elevation, config)
 
 
 def build_evidence(
-    xyz: np.ndarray, height: np.ndarray, sensor_height_m: float, config: EvidenceConfig
+    xyz: np.ndarray,
+    height: np.ndarray,
+    sensor_height_m: float,
+    ground_elevation: GroundElevation,
+    config: EvidenceConfig,
 ) -> Evidence:
     """Collects what the beams hit and what they passed through.
 
-    A beam to a return at range rho and height h is at height hs + t (h - hs) at range t rho, where
-    hs is the sensor's height. The space below it is free where that is between the free heights.
+    Over even ground, a beam to a return at range rho and height h is at height hs + t (h - hs) at range
+    t rho, where hs is the sensor's height. The space below it is free where that is between the free heights.
+    Over other ground its height is measured at one place, in the middle of those.
 
     Args:
       xyz: (n, 3) finite, m, sensor frame: all returns, ground included.
       height: (n,) m above the ground.
       sensor_height_m: height of the sensor above the ground.
+      ground_elevation: of the ground under the beams.
       config: the grid, and the heights, all exclusive, of what is a hit, free, or support.
 
     Returns:
@@ -76,7 +92,7 @@ def build_evidence(
     hit &= rho < num_ranges * range_cell_m
     np.add.at(hits, (azimuth[hit], (rho[hit] / range_cell_m).astype(int)), 1)
 
-    start, end = _free_interval(rho, height, sensor_height_m, config)
+    start, end = _free_interval(xyz, height, sensor_height_m, ground_elevation, config)
     # Only cells that lie wholly within the interval are free.
     first = np.minimum((start / range_cell_m).astype(int) + 1, num_ranges)
     last = np.minimum((end / range_cell_m).astype(int), num_ranges)
@@ -118,14 +134,23 @@ def _sums_before(cells: np.ndarray) -> np.ndarray:
 
 
 def _free_interval(
-    rho: np.ndarray, height: np.ndarray, sensor_height_m: float, config: EvidenceConfig
+    xyz: np.ndarray,
+    height: np.ndarray,
+    sensor_height_m: float,
+    ground_elevation: GroundElevation,
+    config: EvidenceConfig,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Ranges between which each beam is within the heights; empty for beams that do not fall."""
+    heights = float(config.free_min_height_m), float(config.free_max_height_m)
     descent = height - sensor_height_m
     falls = descent < -MIN_DESCENT_M
     descent = np.where(falls, descent, -1.0)
-    enters = np.maximum((config.free_max_height_m - sensor_height_m) / descent, 0.0)
-    leaves = np.minimum((config.free_min_height_m - sensor_height_m) / descent, 1.0)
+    half_way = np.clip((np.mean(heights) - sensor_height_m) / descent, 0.0, 1.0)
+    there = half_way[:, None] * xyz
+    above_even = there[:, 2] - ground_elevation(there) - (sensor_height_m + half_way * descent)
+    leaves, enters = ((h - above_even - sensor_height_m) / descent for h in heights)
+    enters, leaves = np.maximum(enters, 0.0), np.minimum(leaves, 1.0)
+    rho = np.hypot(xyz[:, 0], xyz[:, 1])
     end = rho * leaves - np.where(leaves >= FULL_BEAM, config.end_gap_m, 0.0)
     return np.where(falls, rho * enters, 0.0), np.where(falls, end, 0.0)
 
@@ -166,9 +191,22 @@ def weigh_boxes(evidence: Evidence, boxes: np.ndarray, *, num_rays: int) -> tupl
       num_rays: rays a box.
 
     Returns:
-      The fractions, and (B,) int, see `ground_support`.
+      The fractions, and (B,) int: ground points round its centre or, if more, round its point nearest to the
+      sensor, see `ground_support`.
     """
-    return cast_rays(evidence, boxes, num_rays=num_rays), ground_support(evidence, boxes[:, :2])
+    support = [ground_support(evidence, place) for place in (boxes[:, :2], _nearest_points(boxes))]
+    return cast_rays(evidence, boxes, num_rays=num_rays), np.maximum(*support)
+
+
+def _nearest_points(boxes: np.ndarray) -> np.ndarray:
+    """(B, 2) m: the point of each box that is nearest to the sensor."""
+    x, y, length, width, yaw = boxes.T
+    along, across = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    nearest = np.zeros((2, len(boxes)))
+    for axis, size in ((along, length), (across, width)):
+        middle = axis[0] * x + axis[1] * y
+        nearest += axis * np.clip(0.0, middle - size / 2, middle + size / 2)
+    return nearest.T
 
 
 def cast_rays(evidence: Evidence, boxes: np.ndarray, *, num_rays: int) -> RayFractions:

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.config import EvidenceConfig
+from jaxbox.geometry.planar import rotate
 from jaxbox.stages._grids import sum_of_neighbours
-from jaxbox.stages.state import Boxes, Evidence, FlatBoxes, Ground, RayFractions, Sweep
+from jaxbox.stages.state import Boxes, Evidence, FlatBoxes, Ground, GroundElevation, RayFractions, Sweep
 from jaxbox.xla import chunks
 from jaxbox.xla.arithmetic import arctan2, cos_sin
 from jaxbox.xla.loops import apply_in_turn, fast_axis, map_rows
@@ -51,12 +52,15 @@ MIN_SLOPE = 1e-9
 """Least slope of a ray against a face: a ray along it lies wholly within the slab, or wholly outside."""
 
 
-def observe(sweep: Sweep, ground: Ground, config: EvidenceConfig) -> Evidence | None:
+def observe(
+    sweep: Sweep, ground: Ground, ground_elevation: GroundElevation, config: EvidenceConfig
+) -> Evidence | None:
     """What the beams saw.
 
     Args:
       sweep: of N rows.
       ground: below them.
+      ground_elevation: asks for the ground under other places.
       config: of the evidence.
 
     Returns:
@@ -66,23 +70,30 @@ def observe(sweep: Sweep, ground: Ground, config: EvidenceConfig) -> Evidence | 
         return None
     chex.assert_shape([sweep.inlier, ground.height], sweep.xyz.shape[:1])
     sensor_height_m = -ground.plane.coefficients[2]
-    return build_evidence(sweep.xyz, ground.height, sweep.inlier, sensor_height_m, config)
+    return build_evidence(sweep.xyz, ground.height, sweep.inlier, sensor_height_m, ground_elevation, config)
 
 
 def build_evidence(
-    xyz: jax.Array, height: jax.Array, mask: jax.Array, sensor_height_m: jax.Array, config: EvidenceConfig
+    xyz: jax.Array,
+    height: jax.Array,
+    mask: jax.Array,
+    sensor_height_m: jax.Array,
+    ground_elevation: GroundElevation,
+    config: EvidenceConfig,
 ) -> Evidence:
     """Draws every beam into a polar grid: where it was free, and where it returned.
 
-    A beam from the sensor at height s to a return at range rho and height h < s is at height
-    s + t (h - s) at the fraction t of its way. Where that lies between the two free heights, no vehicle
-    stands.
+    Over even ground, a beam from the sensor at height s to a return at range rho and height h < s is at
+    height s + t (h - s) at the fraction t of its way. Where that lies between the two free heights, no
+    vehicle stands. Where the ground rises or falls on the way, the height is measured in the middle of that
+    part, and what it is more than this is added.
 
     Args:
       xyz: (N, 3) float32, m, sensor frame.
       height: (N,) float32, m, above the ground.
       mask: (N,) bool, points that count.
       sensor_height_m: () float32, m, above the ground.
+      ground_elevation: asks for the ground under the beams.
       config: the grid, A azimuths by R ranges, and the heights of what is a hit, free, or support.
 
     Returns:
@@ -99,8 +110,12 @@ def build_evidence(
     drop = height - sensor_height_m
     downward = returned & (drop < -MIN_DROP_M)
     drop = jnp.where(downward, drop, -1.0)
-    enter = jnp.maximum((config.free_max_height_m - sensor_height_m) / drop, 0)
-    leave = jnp.minimum((config.free_min_height_m - sensor_height_m) / drop, 1)
+    middle_height_m = (config.free_min_height_m + config.free_max_height_m) / 2
+    middle = jnp.clip((middle_height_m - sensor_height_m) / drop, 0, 1)
+    place = middle[:, None] * xyz
+    rise = place[:, 2] - ground_elevation(place) - (sensor_height_m + middle * drop)
+    enter = jnp.maximum((config.free_max_height_m - rise - sensor_height_m) / drop, 0)
+    leave = jnp.minimum((config.free_min_height_m - rise - sensor_height_m) / drop, 1)
     first_m = rho * enter
     last_m = rho * leave - jnp.where(leave >= ENDS_AT_RETURN, config.end_gap_m, 0)
     first = jnp.minimum((first_m / range_cell_m).astype(jnp.int32) + 1, num_ranges)
@@ -240,13 +255,22 @@ def weigh_boxes(
 
     Returns:
       rays: (Q,) fractions.
-      support: (Q,) float32, see `ground_support`.
+      support: (Q,) float32, ground points round its centre or, if more, round its point nearest to the
+        sensor: the middle of a long vehicle may lie out of sight. See `ground_support`.
     """
 
     def weigh(boxes: Boxes) -> tuple[RayFractions, jax.Array]:
-        return cast_rays(evidence, boxes, config, num_rays=num_rays), ground_support(evidence, boxes.center)
+        support = [ground_support(evidence, place) for place in (boxes.center, _nearest_point(boxes))]
+        return cast_rays(evidence, boxes, config, num_rays=num_rays), jnp.maximum(*support)
 
     return map_rows(weigh, boxes, num_rows=num_boxes, chunk=chunks.RAYS)
+
+
+def _nearest_point(boxes: Boxes) -> jax.Array:
+    """(Q, 2) m: the point of each box that is nearest to the sensor."""
+    half = jnp.stack([boxes.length, boxes.width], axis=1) / 2
+    center = rotate(boxes.center, -boxes.yaw)
+    return rotate(center - jnp.clip(center, -half, half), boxes.yaw)
 
 
 Fan = tuple[jax.Array, ...]
