@@ -28,7 +28,7 @@ def check_config(bus):
     assert config_from_toml(config_to_toml(config)) == config
     assert all_fields(config)["vehicles.classes.3.length_m"] == bus.prior.length_m == 12.0
     longer = config_from_toml("[[vehicles.classes]]\n" * 4 + "length_m = 12.5").vehicles.classes
-    assert [prior.length_m for prior in longer] == [3.9, 4.98, 10.81, 12.5]
+    assert [prior.length_m for prior in longer] == [3.9, 4.98, 8.5, 12.5]
 
 
 def check_words(bus):

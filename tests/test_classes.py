@@ -23,7 +23,7 @@ def copy_with_a_bus(folder):
     text = table.read_text()
     (truck,) = re.findall(r"^    TRUCK = ClassPrior\(.*?^    \)\n", text, re.MULTILINE | re.DOTALL)
     assert text.endswith(truck), "classes are added at the end"
-    table.write_text(text + truck.replace("TRUCK", "BUS").replace("10.81", "12.0"))
+    table.write_text(text + truck.replace("TRUCK", "BUS").replace("length_m=8.5", "length_m=12.0"))
 
 
 def test_another_class_is_one_entry_in_one_file(tmp_path):

@@ -682,6 +682,15 @@ def test_points_round_a_box_are_shared_out_by_margin_ring_and_height():
     assert (around.num_inside, around.top, around.num_above, around.num_ring) == (2, 1.4, 2, 2)
 
 
+def test_the_ring_of_a_long_vehicle_reaches_farther_past_its_ends_but_not_its_sides():
+    box = np.array([10.0, 0.0, 8.0, 2.0, 0.0])
+    xyz = np.array([[10, 0, 0], [16.4, 0.5, 0], [3.6, -1.4, 0], [16.6, 0, 0], [10, 1.6, 0]])
+    for past_ends_m, num_ring in ((0, 0), (2, 2)):
+        prior = dataclasses.replace(LOW_CAR, past_ends_m=past_ends_m)
+        around = reference.count_points_around(box, prior, obstacles_of(xyz, np.ones(5)), AROUND)
+        assert (around.num_inside, around.num_ring) == (1, num_ring)
+
+
 def test_depth_is_behind_the_nearest_visible_face_and_endless_round_the_sensor():
     box = np.array([10.0, 0.0, 4.0, 2.0, 0.0])
     rear_only = reference.depth_behind_faces(np.array([[8.0, 0.0], [8.5, 0.9], [7.9, 0.0]]), box)

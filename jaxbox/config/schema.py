@@ -167,7 +167,7 @@ class ClusteringConfig:
     """Growth of the linking distance with range beyond the start, per metre; 0 keeps it fixed."""
     min_points: Scalar = 8.0
     """Clusters with fewer points are dropped."""
-    max_extent_m: Scalar = 12.0
+    max_extent_m: Scalar = 18.0
     """Clusters longer than this along x or y are dropped."""
 
 
@@ -311,7 +311,8 @@ class VehicleConfig:
     margin_m: Scalar = 0.1
     """A point this far outside a box still counts as inside."""
     ring_m: Scalar = 0.5
-    """A point farther outside than the margin but nearer than this speaks against the box."""
+    """A point farther outside than the margin but nearer than this speaks against the box; past the ends of
+    long vehicles also one that is ``ClassPrior.past_ends_m`` farther."""
     top_quantile: Scalar = 0.01
     """Share of the points in a box that may lie above its top: a single return in the air is not a roof."""
     top_margin_m: Scalar = 0.03

@@ -121,7 +121,8 @@ def count_points_around(
     Args:
       box: (5,): x, y, length, width in m and yaw in rad.
       prior: points lower than `count_max_height_m` belong to the vehicle, and those farther than `recess_m`
-        behind each face that the sensor sees are recessed.
+        behind each face that the sensor sees are recessed; the ring reaches `past_ends_m` farther past the
+        ends.
       obstacles: all points above the ground.
       config: a point less than the margin outside counts as inside, one farther but less than the ring is in
         the ring; which points are upper ones, and which share of those inside may lie above the top.
@@ -131,7 +132,8 @@ def count_points_around(
     """
     if obstacles.tree is None:
         return cluster_alone(0, 0.0)
-    reach_m = np.hypot(box[2], box[3]) / 2 + 2 * config.ring_m
+    longer = np.array([*box[:2], box[2] + 2 * prior.past_ends_m, *box[3:]])
+    reach_m = np.hypot(longer[2], longer[3]) / 2 + 2 * config.ring_m
     near = obstacles.tree.query_ball_point(box[:2], reach_m)
     xy, height = obstacles.xyz[near, :2], obstacles.height[near]
     outside = distance_outside(xy, box)
@@ -143,7 +145,7 @@ def count_points_around(
         num_inside=int((within & counted).sum()),
         top=top,
         num_above=int((within & ~counted).sum()),
-        num_ring=int((~within & (outside < config.ring_m) & counted).sum()),
+        num_ring=int((~within & (distance_outside(xy, longer) < config.ring_m) & counted).sum()),
         num_upper=int(upper.sum()),
         num_recessed=int((upper & (depth_behind_faces(xy, box) > prior.recess_m)).sum()),
     )

@@ -255,7 +255,8 @@ def count_points_around(
     Args:
       boxes: (P, 5) float32: x, y, length, width (m), yaw (rad).
       prior: fields of (P,) float32: points lower than `count_max_height_m` belong to the vehicle, and
-        those farther than `recess_m` behind the faces that the sensor sees are recessed.
+        those farther than `recess_m` behind the faces that the sensor sees are recessed; the ring reaches
+        `past_ends_m` farther past the ends.
       num_boxes: () int32, rows that hold a box.
       obstacles: all points above the ground.
       config: margin, ring, and what upper points and strays are. A `top_quantile` of 0 makes the highest
@@ -283,7 +284,7 @@ def count_points_around(
     def prepare(rows: tuple[jax.Array, ...]) -> tuple[jax.Array, list[jax.Array], list[jax.Array]]:
         boxes, *others = rows
         frames = _frames(boxes, *others)
-        reach = jnp.abs(frames[:, 2:4]) * (frames[:, 4:5] + ring_m)
+        reach = jnp.abs(frames[:, 2:4]) * (frames[:, 6:7] + ring_m)
         reach = reach + jnp.abs(frames[:, 3:1:-1]) * (frames[:, 5:6] + ring_m)
         low = [cell(boxes[:, axis] - reach[:, axis], axis) for axis in (0, 1)]
         return frames, low, [cell(boxes[:, axis] + reach[:, axis], axis) for axis in (0, 1)]
@@ -299,7 +300,8 @@ def count_points_around(
         top = _top(highest, config.top_quantile * inside, counts[:, NUM_KINDS:], frames[:, -1])
         return jnp.stack([inside, top, above, ring, upper, recessed], axis=1)
 
-    rows = map_rows(prepare, (boxes, prior.count_max_height_m, prior.recess_m), num_rows=num_boxes)
+    priors = prior.count_max_height_m, prior.recess_m, prior.past_ends_m
+    rows = map_rows(prepare, (boxes, *priors), num_rows=num_boxes)
     return NeighbourhoodCounts(map_rows(look, rows, num_rows=num_boxes, chunk=chunks.BOXES))
 
 
@@ -317,8 +319,10 @@ def cluster_alone(num_points: jax.Array, top: jax.Array) -> NeighbourhoodCounts:
     return NeighbourhoodCounts(jnp.stack([num_points, top, none, none, none, none], axis=1))
 
 
-def _frames(boxes: jax.Array, count_max_height_m: jax.Array, recess_m: jax.Array) -> jax.Array:
-    """(P, 11) the frames that points round a box are compared in, see `_judge`."""
+def _frames(
+    boxes: jax.Array, count_max_height_m: jax.Array, recess_m: jax.Array, past_ends_m: jax.Array
+) -> jax.Array:
+    """(P, 12) the frames that points round a box are compared in, see `_judge`."""
     x, y, length, width, yaw = boxes.T
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     half_l, half_w = length / 2, width / 2
@@ -327,7 +331,8 @@ def _frames(boxes: jax.Array, count_max_height_m: jax.Array, recess_m: jax.Array
     face_u = jnp.where(jnp.abs(sensor_u) > half_l, half_l - recess_m, jnp.inf)
     face_v = jnp.where(jnp.abs(sensor_v) > half_w, half_w - recess_m, jnp.inf)
     facing = jnp.sign(sensor_u), jnp.sign(sensor_v)
-    return jnp.stack([x, y, cos, sin, half_l, half_w, *facing, face_u, face_v, count_max_height_m], axis=1)
+    half = half_l, half_w, half_l + past_ends_m
+    return jnp.stack([x, y, cos, sin, *half, *facing, face_u, face_v, count_max_height_m], axis=1)
 
 
 def _count_runs(
@@ -360,17 +365,18 @@ def _judge(
     frames: jax.Array, valid: jax.Array, points: Sequence[jax.Array], config: VehicleConfig
 ) -> tuple[jax.Array, jax.Array]:
     """Counts of each kind and level of points in blocks (B, L) of them, and the highest inside (B,)."""
-    box_x, box_y, cos, sin, half_l, half_w, facing_u, facing_v, face_u, face_v, max_height = (
+    box_x, box_y, cos, sin, half_l, half_w, ring_half_l, facing_u, facing_v, face_u, face_v, max_height = (
         frames[:, k, None] for k in range(frames.shape[1])
     )
     x, y, height = points
     dx, dy = x - box_x, y - box_y
     u, v = dx * cos + dy * sin, dy * cos - dx * sin
-    out = jnp.where(valid, jnp.maximum(jnp.abs(u) - half_l, jnp.abs(v) - half_w), jnp.inf)
-    inside, low = out < config.margin_m, height < max_height
+    out_u, out_v = jnp.abs(u), jnp.where(valid, jnp.abs(v) - half_w, jnp.inf)
+    inside, low = jnp.maximum(out_u - half_l, out_v) < config.margin_m, height < max_height
+    ring = ~inside & low & (jnp.maximum(out_u - ring_half_l, out_v) < config.ring_m)
     upper = inside & low & (height > config.upper_height_m)
     recessed = upper & (jnp.minimum(face_u - facing_u * u, face_v - facing_v * v) > 0)
-    kinds = (inside & low, inside & ~low, ~inside & (out < config.ring_m) & low, upper, recessed)
+    kinds = (inside & low, inside & ~low, ring, upper, recessed)
     share = height / max_height - LOWEST_LEVEL
     level = jnp.minimum(share * (NUM_LEVELS / (1 - LOWEST_LEVEL)), NUM_LEVELS - 1).astype(jnp.int32)
     level = jnp.where(inside & low & (share > 0), level, NUM_LEVELS)
