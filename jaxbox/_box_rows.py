@@ -185,7 +185,9 @@ class BoxRows(ByValue, Generic[AnyBox]):
             "score": boxes.score,
             **dict(zip(("center_x", "center_y", "center_z"), boxes.center.T, strict=True)),
             **dict(zip(("length", "width", "height"), boxes.size.T, strict=True)),
-            **{name: getattr(boxes, name) for name in ("yaw", "heading", "front_probability")},
+            "yaw": boxes.yaw,
+            "heading": boxes.heading,
+            "front_probability": boxes.front_probability,
         }
 
     def to_pandas(self) -> Any:

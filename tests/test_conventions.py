@@ -18,19 +18,11 @@ PROJECT = ROOT.parent
 
 # Each layer may import those before it, and itself.
 LAYERS = [
-    {
-        "_version",
-        "_extras",
-        "_files",
-        "_interrupts",
-        "_padding",
-        "_box",
-        "_box_rows",
-        "config",
-        "types",
-        "geometry",
-        "xla",
-    },
+    # The standard library and NumPy alone.
+    {"_version", "_extras", "_files", "_interrupts", "_padding"},
+    {"config"},
+    # `_box` and `_box_rows` are parts of `types`: what one box, and what boxes of any kind, can do.
+    {"_box", "_box_rows", "types", "geometry", "xla"},
     {"stages"},
     {"detector"},
     {"tracking"},
@@ -111,6 +103,10 @@ def test_only_what_people_call_on_boxes_imports_by_name_and_so_past_the_layers()
     assert [relative(path) for path in importing] == ["_box_rows.py"]
     calls = {relative(path) for path in source_files() if "later_module(" in path.read_text()}
     assert calls == {"_box_rows.py", "types.py", "tracking/tracks.py"}
+
+
+def test_the_first_layer_imports_nothing_of_the_package():
+    assert not {room for room in LAYERS[0] for _ in imported_rooms(ROOT / f"{room}.py")}
 
 
 def test_every_room_has_a_layer():
@@ -256,8 +252,10 @@ def test_the_readme_names_both_commands():
 # What exists because of a compiler is in jaxbox.xla alone.
 
 STAGES = sorted((ROOT / "stages").glob("*.py"))
-PLAIN = sorted([*STAGES, *(ROOT / "geometry").glob("*.py"), ROOT / "detector.py"])
-"""Files that say what is computed, and nothing of how a compiler makes it fast."""
+METHOD = {"stages", "geometry", "detector", "tracking"}
+"""From the points to the tracks: they say what is computed, and nothing of how a compiler makes it fast."""
+COMPUTING = METHOD | {"config", "types", "evaluation", "synthetic"}
+"""Those, and all others with functions that are compiled."""
 
 LOOPS = {"while_loop", "fori_loop", "scan", "cond", "switch", "map"}
 FOR_A_COMPILER = {"platform_dependent", "optimization_barrier"}
@@ -348,6 +346,11 @@ def constants(tree):
                     yield name.id
 
 
+def of_rooms(rooms):
+    """Source files of some rooms."""
+    return [path for path in source_files() if room_of(path) in rooms]
+
+
 def outside(*places):
     """Source files of the package but those in some rooms, or of a name."""
     return [
@@ -373,9 +376,13 @@ def test_only_xla_and_run_ask_what_a_program_is_built_for(path):
     assert "on_accelerator" not in names_in(parsed(path))
 
 
-@pytest.mark.parametrize("path", PLAIN, ids=relative)
-def test_stages_do_nothing_with_bits_and_say_nothing_of_a_compiler(path):
+@pytest.mark.parametrize("path", of_rooms(COMPUTING), ids=relative)
+def test_bit_tricks_are_in_xla(path):
     assert list(bit_tricks(parsed(path))) == []
+
+
+@pytest.mark.parametrize("path", of_rooms(METHOD), ids=relative)
+def test_the_method_says_nothing_of_a_compiler(path):
     assert [words for words in words_about(path) if COMPILER_WORDS.search(words)] == []
 
 

@@ -51,7 +51,7 @@ def track_step(
     two stages as ByteTrack (Zhang et al., 2022).
     """
     config = TrackConfig() if config is None else config
-    config = TrackConfig(**{name: jnp.asarray(value, jnp.float32) for name, value in vars(config).items()})
+    config = jax.tree.map(lambda value: jnp.asarray(value, jnp.float32), config)
     interval = check_interval(jnp.asarray(dt, jnp.float32), T_previous_current, state.started, config)
     seen = _with_rows(seen)
     order = jnp.argsort(-jnp.where(seen.valid, seen.score, -jnp.inf), stable=True)

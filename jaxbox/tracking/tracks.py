@@ -244,19 +244,18 @@ class Tracks(BoxRows[Track]):
     def to_columns(self) -> dict[str, np.ndarray]:
         """Columns as `jaxbox.io.parquet` has them: ``id`` first, then those of boxes, state and velocity."""
         tracks = self[:]
-        words = {
-            "state": np.array([Motion(motion).word for motion in tracks.motion.tolist()], str),
-            "sight": np.array([Sight(sight).name.lower() for sight in tracks.sight.tolist()], str),
-        }
-        same = ("confirmed", "age", "hits")
         return {
             "id": np.asarray(tracks.id),
             **super().to_columns(),
-            **words,
-            **{name: np.asarray(getattr(tracks, name)) for name in same},
+            "state": np.array([Motion(motion).word for motion in tracks.motion.tolist()], str),
+            "sight": np.array([Sight(sight).name.lower() for sight in tracks.sight.tolist()], str),
+            "confirmed": np.asarray(tracks.confirmed),
+            "age": np.asarray(tracks.age),
+            "hits": np.asarray(tracks.hits),
             **dict(zip(("velocity_x", "velocity_y"), np.asarray(tracks.velocity).T, strict=True)),
             "speed": np.asarray(tracks.speed),
-            **{name: np.asarray(getattr(tracks, name)) for name in ("turn_rate", "lateral_shift_m")},
+            "turn_rate": np.asarray(tracks.turn_rate),
+            "lateral_shift_m": np.asarray(tracks.lateral_shift_m),
         }
 
     def to_kitti(
