@@ -50,8 +50,7 @@ def track_step(
     Reference: oracle `jaxbox.reference.tracking.track_step`; Kalman (1960) with the constant-velocity model;
     two stages as ByteTrack (Zhang et al., 2022).
     """
-    config = TrackConfig() if config is None else config
-    config = jax.tree.map(lambda value: jnp.asarray(value, jnp.float32), config)
+    config = _as_arrays(TrackConfig() if config is None else config)
     interval = check_interval(jnp.asarray(dt, jnp.float32), T_previous_current, state.started, config)
     seen = _with_rows(seen)
     order = jnp.argsort(-jnp.where(seen.valid, seen.score, -jnp.inf), stable=True)
@@ -72,6 +71,11 @@ def track_step(
     counts = _count(fates, num_births, state.slots.alive, kept.alive, after, interval.skipped)
     row = jnp.where(interval.skipped, len(order), jnp.minimum(detection, origin))
     return after, _answer(after, seen, row, order, counts, interval, config)
+
+
+def _as_arrays(config: TrackConfig) -> TrackConfig:
+    """Thresholds as float32, so that Python's numbers and arrays are one program."""
+    return jax.tree.map(lambda value: jnp.asarray(value, jnp.float32), config)
 
 
 class Fates(NamedTuple):
