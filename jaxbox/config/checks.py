@@ -14,7 +14,7 @@ from jaxbox.config.tracking import TrackConfig
 
 
 def check_config(config: DetectorConfig) -> None:
-    """Refuses settings that cannot be meant.
+    """Rejects invalid settings.
 
     Args:
       config: of the detector. Thresholds that are being traced have no values yet, and are not looked at.
@@ -64,7 +64,7 @@ def _thresholds(structure: Any) -> list[tuple[str, Range]]:
         _check_grids(config)
     ranges = traced_ranges(config)
     for name, value in traced_fields(config).items():
-        # None is no leaf to JAX.
+        # JAX does not count None as a leaf.
         if value is None:
             checked_number(name, value, ranges[name])
     return list(ranges.items())

@@ -28,7 +28,8 @@ BACKSCATTER_SHARE = 0.3
 """Of the beams that fog takes, the share that come back from the fog itself."""
 
 MIN_RANGE_M = 2.0
-"""No spurious return is nearer: an HDL-64E reports none nearer than 0.9 m, and the carrier is excluded."""
+"""Spurious returns are at least this far: an HDL-64E reports none nearer than 0.9 m, and the ego vehicle
+is excluded."""
 
 ROAD_BELOW_M = 1.3
 """What lies lower than this below the sensor is taken for road, for sensors at about 1.7 m."""
@@ -194,7 +195,7 @@ def drive_during_sweep(
 def turn_during_sweep(
     xyz: np.ndarray, intensity: np.ndarray, rate_deg_s: float, rng: np.random.Generator
 ) -> Points:
-    """Distorts a sweep as if the sensor's carrier turned meanwhile, see `drive_during_sweep`.
+    """Distorts a sweep as if the ego vehicle turned meanwhile, see `drive_during_sweep`.
 
     Args:
       xyz: (n, 3) m.

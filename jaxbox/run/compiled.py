@@ -52,7 +52,7 @@ def detect(
     Raises:
       ValueError: for fields that contradict each other, a name that no preset has, or arrays of other shapes
         than `PointCloud` says.
-      TypeError: for what is no cloud, no array, no configuration or no key.
+      TypeError: for anything but a cloud or array, a configuration or preset, and a key or seed.
 
     Status bits: all of `Status`; `Detections.raise_if_failed` turns those of full capacities into an error.
 

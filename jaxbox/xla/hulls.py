@@ -25,7 +25,7 @@ def lower_hulls(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.A
     if on_accelerator():
         return _lower_hulls_parallel(x, y)
     far = jnp.inf
-    x, y = materialize((x, y))  # Each turn of the loop reads them.
+    x, y = materialize((x, y))  # Each iteration of the loop reads them.
 
     def step(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         i, _, chain_x, chain_y = state
