@@ -1,5 +1,6 @@
 """The documentation's hooks: what they make of docstrings and pages."""
 
+import importlib
 import importlib.util
 import pathlib
 import re
@@ -110,6 +111,35 @@ def test_the_pictures_of_the_tutorial_are_of_these_steps(tmp_path):
         assert drawn.shape == shown.shape
         # As above.
         assert np.any(drawn != shown, axis=-1).mean() < 0.001, "python examples/single_steps.py docs"
+
+
+ARCHITECTURE = (PROJECT / "docs" / "architecture.md").read_text()
+
+
+def test_the_calls_and_files_that_the_architecture_names_exist():
+    walks = re.findall(r"^## One (?:point|step).*?(?=^## )", ARCHITECTURE, re.MULTILINE | re.DOTALL)
+    calls = {name for walk in walks for cell in first_cells(walk) for name in re.findall(r"`([\w.]+)`", cell)}
+    assert {"ground.remove_ground", "association.associate"} <= calls
+    assert {name for name in calls if not is_known(name)} == set()
+    assert not is_known("scoring.detect")
+    files = set(re.findall(r"`((?:\w+/)+\w+\.py)`", ARCHITECTURE))
+    assert {"stages/ground.py", "tracking/association.py"} <= files
+    places = PROJECT, PROJECT / "jaxbox"
+    assert {name for name in files if not any((place / name).is_file() for place in places)} == set()
+
+
+def first_cells(text):
+    return [line.split("|")[1] for line in text.splitlines() if line.startswith("| ")]
+
+
+def is_known(name):
+    """Whether a dotted name is one of jaxbox, of a stage or of the tracker."""
+    module, _, attribute = name.removeprefix("jaxbox.").rpartition(".")
+    if hasattr(getattr(jaxbox, module, None) if module else jaxbox, attribute):
+        return True
+    homes = [f"jaxbox{home}.{module}" for home in ("", ".stages", ".tracking")]
+    found = [importlib.import_module(home) for home in homes if importlib.util.find_spec(home)]
+    return any(hasattr(home, attribute) for home in found)
 
 
 def test_the_pages_of_the_navigation_are_the_pages_that_exist():
