@@ -49,7 +49,7 @@ def check_ranges(config: DetectorConfig | TrackConfig) -> None:
     values, structure = jax.tree.flatten(config)
     for (name, allowed), value in zip(_thresholds(structure), values, strict=True):
         # Most are such floats: this is part of every call of `detect`.
-        if type(value) is float and allowed.least <= value <= allowed.most:
+        if type(value) is float and allowed.minimum <= value <= allowed.maximum:
             continue
         if not isinstance(value, jax.core.Tracer):
             checked_number(name, jax.device_get(value), allowed)

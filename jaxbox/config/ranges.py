@@ -25,11 +25,11 @@ class ConfigError(ValueError):
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """The numbers that a setting takes, from `least` to `most`."""
+    """The numbers that a setting takes, from `minimum` to `maximum`."""
 
-    least: float
+    minimum: float
     """Smallest number."""
-    most: float
+    maximum: float
     """Largest number."""
     text: str
     """In words, for errors and the documentation."""
@@ -129,7 +129,7 @@ def checked_number(name: str, value: Any, allowed: Range) -> float:
     # TypeError for anything but a number, OverflowError for a whole number of hundreds of digits.
     except (TypeError, ValueError, OverflowError):
         number = math.nan
-    if not allowed.least <= number <= allowed.most:
+    if not allowed.minimum <= number <= allowed.maximum:
         raise ConfigError(f"{name} is {shown(value)}; it must be {allowed.text}.")
     return number
 

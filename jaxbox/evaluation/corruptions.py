@@ -93,7 +93,7 @@ def add_range_noise(xyz: np.ndarray, intensity: np.ndarray, std_m: float, rng: n
 
 
 def add_fog(xyz: np.ndarray, intensity: np.ndarray, visibility_m: float, rng: np.random.Generator) -> Points:
-    """Weakens returns by fog, loses the too weak, and lets some of those come back from the fog.
+    """Weakens returns by fog, loses those that are too weak, and lets some of them come back from the fog.
 
     A return from R has the power rho / R^2 exp(-2 alpha R), with alpha = ln(20) / visibility (Koschmieder;
     Hahner et al.), and is seen where that is at least 1 / REACH_M^2. What was seen in clear air had a
@@ -173,10 +173,10 @@ def reflect_below_road(
 def drive_during_sweep(
     xyz: np.ndarray, intensity: np.ndarray, speed_m_s: float, rng: np.random.Generator
 ) -> Points:
-    """Distorts a sweep as if the sensor drove straight on while it turned, and nobody undid it.
+    """Distorts a sweep as if the sensor drove straight on while it turned, without compensation.
 
     A point at azimuth phi is seen phi / 2 pi of a period after the sensor looked straight ahead, and then is
-    nearer by the way gone. The distortion comes on top of what the recording has.
+    nearer by the distance driven. The distortion comes on top of what the recording has.
 
     Args:
       xyz: (n, 3) m.

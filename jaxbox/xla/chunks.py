@@ -71,5 +71,5 @@ SUM_BLOCK = 512
 """Columns of sums in two levels, on an accelerator."""
 
 SINGLE_KERNEL_NUMBERS = 62
-"""Numbers that `jaxbox.xla.barriers.single_kernel` may copy: what reads and writes more than a kilobyte is no
-small loop to XLA."""
+"""Numbers that `jaxbox.xla.barriers.single_kernel` may copy: to XLA a loop that reads and writes more than a
+kilobyte is not small."""

@@ -19,7 +19,7 @@ FIGURES = (("bev", 0.5), ("3d", 0.7))
 """Metric and overlap of the figures that are reported."""
 
 PRECISIONS = (0.90, 0.95)
-"""Recall is reported where precision is at least so much."""
+"""Recall is reported where precision is at least this."""
 
 _NUM_SAMPLES = 40
 _RIGHT, _WRONG, _LEFT_OUT = 1, 0, -1
