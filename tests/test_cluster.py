@@ -255,11 +255,11 @@ def test_a_worker_writes_the_rows_of_the_local_run_and_its_report_is_in_the_file
 
 def test_after_a_death_each_sweep_goes_alone_and_one_that_kills_again_is_given_up(archive, local, tmp_path):
     store = Store(tmp_path)
-    assert not Attempt(store, "part-000000").careful
+    assert not Attempt(store, "part-000000").one_by_one
     # What attempts leave whose workers died: the first in a batch, and two with a sweep alone.
     for number in (1, 2):
         attempt = Attempt(store, "part-000000")
-        assert (attempt.careful, attempt.num_before) == (True, number)
+        assert (attempt.one_by_one, attempt.num_before) == (True, number)
         assert not attempt.gives_up(KILLED_AT)
         attempt.begin(KILLED_AT)
     report = DetectWorker(task_for(tmp_path)).work(partition_of(archive))

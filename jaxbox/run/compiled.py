@@ -114,6 +114,7 @@ def lower(
     Returns:
       What `jax.jit(...).lower` gives.
     """
+    # To pyright what `jax.jit` returns is a function without these methods.
     if platform is None:
         return _detect_jit.trace(*_operands(cloud, config, key)).lower()  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
     with building_for(accelerator=platform != "cpu"):

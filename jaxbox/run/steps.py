@@ -235,6 +235,7 @@ def _best_angles(xy: np.ndarray, start: np.ndarray, total: np.ndarray, config: D
     num_entries = max(fitting_capacity(len(xy)), len(xy))
     x, y = (padded(column, num_entries, np.float32) for column in xy.T)
     begin, count = (padded(values, capacity, np.int32) for values in (start, total))
+    # NumPy's arrays, which a compiled function takes as well.
     lists = PointLists(x, y, begin, count, config.box.max_points)  # pyright: ignore[reportArgumentType]
     packed = PackedConfig.pack(config, accelerator=on_accelerator())
     return np.asarray(_find_angles(lists, np.int32(num_clusters), packed), np.float64)[:num_clusters]
