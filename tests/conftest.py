@@ -26,7 +26,7 @@ FAST = {
     "test_paper_table.py", "test_point_times.py", "test_reference.py", "test_reliability_benchmarks.py",
     "test_sensors_benchmark.py", "test_speed_benchmarks.py", "test_synthetic.py",
     "test_tracking_poses.py", "test_tuning.py", "test_types.py", "test_viz.py", "test_viz_judged.py",
-    "test_viz_tracks.py", "test_xla_laws.py", "test_xla_loops.py",
+    "test_viz_tracks.py", "test_xla_laws.py",
 }  # fmt: skip
 """Files whose tests make up ``pytest -m fast``, but for the tests in `SLOW`."""
 SLOW = {

@@ -142,6 +142,29 @@ def is_known(name):
     return any(hasattr(home, attribute) for home in found)
 
 
+def anchors(page):
+    """Anchors of a page's headings, as the site and GitHub make them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", heading.lower())) for heading in headings}
+
+
+def test_links_to_a_section_lead_to_one():
+    pages = [*(PROJECT / "docs").rglob("*.md"), PROJECT / "README.md"]
+    links = [
+        (page, link) for page in pages for link in re.findall(r"\]\(([^)\s]*#[^)\s]+)\)", page.read_text())
+    ]
+    broken = []
+    for page, link in links:
+        name, _, anchor = link.partition("#")
+        target = page.parent / name if name else page
+        # Sections of the API are made from its docstrings.
+        if target.is_file() and target.name != "api.md" and anchor not in anchors(target):
+            broken.append((page.name, link))
+    assert len(links) > 20
+    assert broken == []
+
+
 def test_the_pages_of_the_navigation_are_the_pages_that_exist():
     named = set(re.findall(r"[\w/]+\.md", (PROJECT / "mkdocs.yml").read_text()))
     made = set(hook("project_pages").PAGES.values())
