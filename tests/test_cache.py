@@ -195,7 +195,7 @@ jax.monitoring.register_event_listener(lambda name, **_: hits.append(name.endswi
 x = jnp.arange(9.0)
 
 def is_found():
-    # Compiles anew, or takes the entry; the value is right in any case.
+    # Compiles again, or takes the entry; the value is right in any case.
     jax.clear_caches()
     hits.clear()
     assert jax.jit(lambda x: jnp.sort(x * 3) + 1)(x).tolist()[-1] == 25

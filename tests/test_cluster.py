@@ -642,7 +642,7 @@ def test_drives_on_ray_broken_mended_killed_and_resumed_have_the_tracks_of_one_p
         assert (manifest["options"]["poses"], manifest["options"]["track"]["max_misses"]) == ("boxes", 3.0)
         assert not manifest["finished"]
 
-        # The sweep is mended, only its drive is done again, and its worker dies in the middle.
+        # The sweep is repaired, only its drive is done again, and its worker dies in the middle.
         broken.write_bytes(whole)
         before = {path.name: path.stat().st_mtime_ns for path in output.glob("*.parquet")}
         target, killed = "/drives/plain/000002.bin", []
@@ -665,7 +665,7 @@ def test_drives_on_ray_broken_mended_killed_and_resumed_have_the_tracks_of_one_p
     assert changed == ["plain.parquet"]
     manifest = manifest_of(output)
     assert (manifest["finished"], manifest["num_skipped"], manifest["deaths"]) == (True, 1, {"plain": 1})
-    assert tables_of(output) == tracked_here(root, tmp_path / "mended", "--poses", "boxes")
+    assert tables_of(output) == tracked_here(root, tmp_path / "repaired", "--poses", "boxes")
     names = ["00.parquet", "config.toml", "manifest.json", "plain.parquet"]
     assert sorted(path.name for path in output.iterdir()) == names
 
