@@ -5,7 +5,7 @@
 Each start is a process of its own, on a built-in sweep padded to 131,072 points: as the command line does it,
 and as a Python user does, who calls `jaxbox.enable_cache` and `jaxbox.detect`. Its cache is empty, with or
 without traced programs that were shipped, or full. The total is the clock of whoever started the process; CPU
-time, of all threads, is steadier where other work runs beside it.
+time, of all threads, is steadier where other work runs at the same time.
 """
 
 import argparse

@@ -1,4 +1,4 @@
-"""Times a step of the tracker beside detect() on real sequences, and watches its memory for an hour.
+"""Times a step of the tracker next to detect() on real sequences, and watches its memory for an hour.
 
     NPROC=1 python -m benchmarks.bench_tracking_step [--preset fast] [--quick] [--json FILE]
 
@@ -46,7 +46,7 @@ DT_S = 0.1
 ROWS, CARS, AZIMUTHS = 128, 60, 1440
 """Rows of detections of simulated traffic, cars about the sensor, and azimuth cells."""
 REACH_M, TURN_RAD = 60.0, 0.01
-"""Cars come and go at this distance, and the carrier turns by so much a sweep."""
+"""Cars come and go at this distance, and the ego vehicle turns by so much a sweep."""
 
 
 def sequences(quick: bool) -> list[list[Sweep]]:
@@ -104,7 +104,7 @@ def summarise(spent: np.ndarray, passes: int) -> dict[str, Any]:
 
 
 def simulated(rng: np.random.Generator) -> Iterator[tuple[Observations, np.ndarray]]:
-    """Detections of cars that drive past a carrier which turns, and its motion, without end."""
+    """Detections of cars that drive past a turning ego vehicle, and its motion, without end."""
     cos, sin = np.cos(TURN_RAD), np.sin(TURN_RAD)
     motion = np.eye(4, dtype=np.float32)
     motion[:2, :2] = [[cos, -sin], [sin, cos]]

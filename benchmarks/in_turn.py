@@ -106,7 +106,7 @@ def take_turns(
     """Runs each sweep with one checkout and then the other, in alternating order, several times over.
 
     Args:
-      checkouts: this one, and the one that it is held against.
+      checkouts: this one, and the one that it is compared with.
       sweeps: files of (N, 4) arrays.
       passes: how often each sweep is run, after one call that compiles.
 

@@ -106,7 +106,7 @@ class BoxRows(ByValue, Generic[AnyBox]):
           Those boxes.
 
         Raises:
-          ValueError: for what is no class, naming those that are.
+          ValueError: for an unknown class, naming the known ones.
         """
         wanted = [_label(label).value for label in labels]
         return self[np.isin(_one_sweep(self).label, wanted)]
@@ -185,7 +185,9 @@ class BoxRows(ByValue, Generic[AnyBox]):
             "score": boxes.score,
             **dict(zip(("center_x", "center_y", "center_z"), boxes.center.T, strict=True)),
             **dict(zip(("length", "width", "height"), boxes.size.T, strict=True)),
-            **{name: getattr(boxes, name) for name in ("yaw", "heading", "front_probability")},
+            "yaw": boxes.yaw,
+            "heading": boxes.heading,
+            "front_probability": boxes.front_probability,
         }
 
     def to_pandas(self) -> Any:
@@ -259,7 +261,7 @@ def _chosen_rows(valid: np.ndarray, index: Any) -> np.ndarray:
 
     Raises:
       IndexError: where there is no such box.
-      TypeError: for what is no index.
+      TypeError: for anything but an index.
     """
     rows = np.flatnonzero(valid)
     if isinstance(index, slice):
@@ -275,8 +277,8 @@ def _chosen_rows(valid: np.ndarray, index: Any) -> np.ndarray:
         return rows[:0]
     if index.dtype.kind not in "iu" or index.ndim > 1:
         raise TypeError(
-            f"{index!r} is no index of boxes: give a number, a slice, numbers or a mask (k,). By class it is "
-            '.of("car"), by score .above(0.5), by place .within(polygon).'
+            f"{index!r} is not an index of boxes: give a number, a slice, numbers or a mask (k,). By class "
+            'it is .of("car"), by score .above(0.5), by place .within(polygon).'
         )
     if np.any((index < -len(rows)) | (index >= len(rows))):
         raise IndexError(f"there is no box {index.tolist()}: {len(rows)} boxes, numbered from 0.")
@@ -290,7 +292,7 @@ def _label(label: Label | str) -> Label:
         if str(label).lower() in (known.word, known.plural):
             return known
     words = ", ".join(f'"{known.word}"' for known in Label)
-    raise ValueError(f"{label!r} is no class; there are {words}.")
+    raise ValueError(f"{label!r} is not a class; choose one of {words}.")
 
 
 def _in_polygon(center: np.ndarray, polygon: Any) -> np.ndarray:

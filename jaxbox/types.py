@@ -30,7 +30,7 @@ from jaxbox.config.capacities import CAPACITIES, CLOUD_CAPACITY, Capacity
 from jaxbox.config.class_priors import classes_in_words
 
 GROUND_ABOVE_M = 0.5
-"""A ground plane that passes so high over the origin lies above the sensor: where recordings are in their
+"""A ground plane that passes this high over the origin lies above the sensor: where recordings are in their
 vehicle's frame, with the origin on the ground, it is off by bumps and slopes alone."""
 
 
@@ -91,7 +91,7 @@ def combine_bits(bits: Mapping[Any, jax.Array]) -> jax.Array:
 
 
 def to_host(tree: Any, status: jax.Array) -> Any:
-    """A tree in NumPy arrays: on a CPU views of JAX's own memory, from an accelerator all of it at once.
+    """A tree in NumPy arrays: on a CPU views of JAX's own memory, from an accelerator in one transfer.
 
     Args:
       tree: of arrays.

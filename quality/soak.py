@@ -125,7 +125,7 @@ def soak(
             memory.append((frame, resident_kb()[0]))
     return {
         "frames": len(intervals),
-        "points": {"least": min(points), "median": float(np.median(points)), "most": max(points)},
+        "points": {"minimum": min(points), "median": float(np.median(points)), "maximum": max(points)},
         "compiles_in_warm_up": warm_compiles,
         "programs": programs,
         "recompiles": counter.count - warm_compiles + compiled.count_compilations() - programs,

@@ -26,11 +26,13 @@ FAST = {
     "test_paper_table.py", "test_point_times.py", "test_reference.py", "test_reliability_benchmarks.py",
     "test_sensors_benchmark.py", "test_speed_benchmarks.py", "test_synthetic.py",
     "test_tracking_poses.py", "test_tuning.py", "test_types.py", "test_viz.py", "test_viz_judged.py",
-    "test_viz_tracks.py", "test_xla_laws.py", "test_xla_loops.py",
+    "test_viz_tracks.py", "test_xla_laws.py",
 }  # fmt: skip
 """Files whose tests make up ``pytest -m fast``, but for the tests in `SLOW`."""
 SLOW = {
     "test_another_class_is_one_entry_in_one_file",
+    "test_files_made_to_fill_the_memory_are_refused",
+    "test_files_that_claim_or_unpack_to_too_much_are_refused_within_time_and_memory",
     "rounds",
     "test_the_pictures_of_the_tutorial_are_of_these_steps",
     "test_the_pipeline_strip_is_of_this_detector",
@@ -38,7 +40,7 @@ SLOW = {
     "test_the_readme_python_example_runs",
     "test_the_rough_look_at_real_sweeps_proposes_enough",
 }
-"""Tests and fixtures that compile the whole detector, or go through many real sweeps."""
+"""Tests and fixtures that compile the whole detector, or go through many real sweeps or large files."""
 
 MAX_MAPS = 20_000
 """Memory maps of a process at the end of a file of tests, above which it forgets its compiled programs."""

@@ -60,7 +60,7 @@ def test_the_variable_names_the_folder_or_switches_the_cache_off(tmp_path, monke
     assert compiled.kept_programs().folder == tmp_path / "named" / cache.PROGRAMS
 
 
-def refused(folder, match):
+def check_refused(folder, match):
     """Nothing is kept, and the reason is said; `detect` goes through programs that were shipped."""
     users = jax.config.values["jax_compilation_cache_dir"]
     with pytest.warns(CacheWarning, match=match):
@@ -75,7 +75,7 @@ def test_a_folder_that_others_may_write_to_is_refused(tmp_path, mode, inner):
     folder = tmp_path / "cache"
     (folder / cache.PROGRAMS).mkdir(parents=True)
     (folder / cache.PROGRAMS if inner else folder).chmod(mode)
-    refused(folder, "Others may write to .*chmod 700")
+    check_refused(folder, "Others may write to .*chmod 700")
 
 
 def test_a_folder_that_others_may_read_is_taken(tmp_path):
@@ -88,7 +88,7 @@ def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path / "users"))
     monkeypatch.setattr(cache, "_ROOT", owner + 2)
     monkeypatch.setattr(os, "getuid", lambda: owner + 1)
-    refused(tmp_path, "belongs to another user")
+    check_refused(tmp_path, "belongs to another user")
     # Root's own is as good as one's own: root can do as it likes anyway.
     monkeypatch.setattr(cache, "_ROOT", owner)
     assert jaxbox.enable_cache(tmp_path) == tmp_path
@@ -96,8 +96,8 @@ def test_a_folder_of_another_user_is_refused(tmp_path, monkeypatch):
 
 def test_a_folder_that_cannot_be_made_is_said(tmp_path):
     (tmp_path / "file").touch()
-    refused(tmp_path / "file" / "cache", r"file: File exists.*JAXBOX_CACHE_DIR")
-    refused(tmp_path / "file", "File exists")
+    check_refused(tmp_path / "file" / "cache", r"file: File exists.*JAXBOX_CACHE_DIR")
+    check_refused(tmp_path / "file", "File exists")
 
 
 def test_systems_without_owners_are_not_asked_for_them(tmp_path, monkeypatch):
@@ -195,7 +195,7 @@ jax.monitoring.register_event_listener(lambda name, **_: hits.append(name.endswi
 x = jnp.arange(9.0)
 
 def is_found():
-    # Compiles anew, or takes the entry; the value is right in any case.
+    # Compiles again, or takes the entry; the value is right in any case.
     jax.clear_caches()
     hits.clear()
     assert jax.jit(lambda x: jnp.sort(x * 3) + 1)(x).tolist()[-1] == 25

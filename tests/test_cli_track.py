@@ -111,7 +111,7 @@ def test_json_lines_hold_all_of_a_track(written):
     assert sum(box["label_probability"].values()) == pytest.approx(1, abs=1e-5)
     # Poses from boxes follow the sensor, which goes 1 m on from sweep to sweep.
     assert records[-1]["pose_source"] == "boxes"
-    assert records[-1]["T_world_sensor"][0][3] == pytest.approx(4 * STEP_M, abs=0.5)
+    assert records[-1]["T_world_sensor"][0][3] == pytest.approx(4 * STEP_M, abs=0.2)
     ids = [{box["id"] for box in record["boxes"] if box["score"] > 0.15} for record in records]
     assert ids[-1] & ids[1]
 

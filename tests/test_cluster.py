@@ -44,7 +44,7 @@ from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.io.parquet import PARQUET_COLUMNS
 from jaxbox.run import cache
 from jaxbox.run.cache import CacheFolders
-from jaxbox.run.carrier import estimated_source
+from jaxbox.run.pose_providers import estimated_source
 from jaxbox.run.versions import versions
 from jaxbox.tracking.poses import PoseSource
 
@@ -255,11 +255,11 @@ def test_a_worker_writes_the_rows_of_the_local_run_and_its_report_is_in_the_file
 
 def test_after_a_death_each_sweep_goes_alone_and_one_that_kills_again_is_given_up(archive, local, tmp_path):
     store = Store(tmp_path)
-    assert not Attempt(store, "part-000000").careful
+    assert not Attempt(store, "part-000000").one_by_one
     # What attempts leave whose workers died: the first in a batch, and two with a sweep alone.
     for number in (1, 2):
         attempt = Attempt(store, "part-000000")
-        assert (attempt.careful, attempt.num_before) == (True, number)
+        assert (attempt.one_by_one, attempt.num_before) == (True, number)
         assert not attempt.gives_up(KILLED_AT)
         attempt.begin(KILLED_AT)
     report = DetectWorker(task_for(tmp_path)).work(partition_of(archive))
@@ -336,29 +336,37 @@ def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_p
     url = f"http://127.0.0.1:{server.server_port}/archive"
     command = ("detect", url, "--output", tmp_path, *SETTINGS, "--engine", "ray", "--jobs", "2")
     command += ("--sweeps-per-partition", "2", "--json")
+    check_interrupted(command, tmp_path, monkeypatch)
+    check_killed_and_broken(command, url, server, tmp_path, local)
+    check_fixed(command, folder, server, tmp_path)
+    check_others_are_refused(command)
 
-    # Ctrl-C after the first partition.
+
+def check_interrupted(command, output, monkeypatch):
+    """Ctrl-C after the first partition."""
     with monkeypatch.context() as patch:
         patch.setattr(ray_engine, "_tell", _interrupt)
         result = run(*command)
     assert result.exit_code == 130, result.output
     assert "--resume goes on" in result.stderr
-    manifest = manifest_of(tmp_path)
+    manifest = manifest_of(output)
     assert (manifest["finished"], manifest["interrupted"], len(manifest["partitions"])) == (False, True, 1)
     assert run(*command).exit_code == 2, "an output that is not empty is not written over"
 
-    # A worker is killed in the middle of a partition, and another has a broken sweep.
+
+def check_killed_and_broken(command, url, server, output, expected):
+    """A worker is killed in the middle of a partition, and another has a broken sweep."""
     target = f"/archive/drive_2/{KILLED_AT}.bin"
-    for path in tmp_path.glob("part-000002*"):
+    for path in output.glob("part-000002*"):
         path.unlink()
     # What a worker leaves that is killed while it sends its file.
-    (tmp_path / ".part-000002.parquet.0a1b.part").write_bytes(b"half")
+    (output / ".part-000002.parquet.0a1b.part").write_bytes(b"half")
     killed = []
 
     def kill_once(path):
         if path == target and not killed:
             killed.append(path)
-            kill_worker_of(tmp_path, "part-000002")
+            kill_worker_of(output, "part-000002")
 
     server.before = kill_once
     server.asked.clear()
@@ -366,9 +374,10 @@ def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_p
     assert result.exit_code == 1, result.output
     assert killed
     assert server.asked[target] == 2, "and is read again by the worker that took its place"
-    assert rows_of(tmp_path).equals(local)
-    manifest = manifest_of(tmp_path)
-    assert (manifest["num_done"], manifest["num_failed"], manifest["num_boxes"]) == (5, 1, len(local))
+    assert rows_of(output).equals(expected)
+    manifest = manifest_of(output)
+    counts = (manifest["num_done"], manifest["num_failed"], manifest["num_boxes"])
+    assert counts == (5, 1, len(expected))
     assert manifest["deaths"] == {"part-000002": 1}
     assert "part-000002: a worker died on it; it was begun again" in result.stderr
     (failure,) = manifest["failures"]
@@ -377,28 +386,31 @@ def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_p
     summary = json.loads(result.stdout.splitlines()[-1])["summary"]
     assert summary["done"] == 5
     assert summary["repeated"] == [{"partition": "part-000002", "deaths": 1}]
-    assert [path.name for path in sorted(tmp_path.iterdir())] == [
+    assert [path.name for path in sorted(output.iterdir())] == [
         "config.toml", "manifest.json", "part-000000.parquet", "part-000001.parquet", "part-000002.parquet",
     ]  # fmt: skip
 
-    # The sweep is fixed, and only its partition is done again.
+
+def check_fixed(command, folder, server, output):
+    """The sweep is fixed, and only its partition is done again."""
     server.asked.clear()
-    before = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.parquet")}
+    before = {path.name: path.stat().st_mtime_ns for path in output.glob("*.parquet")}
     shutil.copy(folder / "drive_0" / "000.bin", folder / "drive_1" / f"{BROKEN}.bin")
     result = run(*command, "--resume", "--quiet")
     assert result.exit_code == 0, result.output
-    changed = [name for name, time in before.items() if (tmp_path / name).stat().st_mtime_ns != time]
+    changed = [name for name, time in before.items() if (output / name).stat().st_mtime_ns != time]
     assert changed == ["part-000001.parquet"]
     assert [path for path in server.asked if path.endswith(".bin") and "drive_1" not in path] == []
-    manifest = manifest_of(tmp_path)
+    manifest = manifest_of(output)
     assert (manifest["finished"], manifest["num_done"], manifest["num_skipped"]) == (True, 6, 2)
     assert manifest["num_done_before"] == 4
     assert sum(len(part["status"]) for part in manifest["partitions"]) == 6
     assert manifest["versions"]["jax"] == jax.__version__
-    config = io.read_config(tmp_path / "config.toml")
-    assert config == DetectorConfig.paper()
+    assert io.read_config(output / "config.toml") == DetectorConfig.paper()
 
-    # Other settings, and other partitions, are not mixed with these.
+
+def check_others_are_refused(command):
+    """Other settings, and other partitions, are not mixed with these."""
     result = run(*command, "--resume", "--set", "vehicles.max_overlap=0.11", "--capacity", "20000")
     assert result.exit_code == 2
     assert "vehicles.max_overlap, capacity differ" in result.stderr.replace("\n", "")
@@ -630,7 +642,7 @@ def test_drives_on_ray_broken_mended_killed_and_resumed_have_the_tracks_of_one_p
         assert (manifest["options"]["poses"], manifest["options"]["track"]["max_misses"]) == ("boxes", 3.0)
         assert not manifest["finished"]
 
-        # The sweep is mended, only its drive is done again, and its worker dies in the middle.
+        # The sweep is repaired, only its drive is done again, and its worker dies in the middle.
         broken.write_bytes(whole)
         before = {path.name: path.stat().st_mtime_ns for path in output.glob("*.parquet")}
         target, killed = "/drives/plain/000002.bin", []
@@ -653,7 +665,7 @@ def test_drives_on_ray_broken_mended_killed_and_resumed_have_the_tracks_of_one_p
     assert changed == ["plain.parquet"]
     manifest = manifest_of(output)
     assert (manifest["finished"], manifest["num_skipped"], manifest["deaths"]) == (True, 1, {"plain": 1})
-    assert tables_of(output) == tracked_here(root, tmp_path / "mended", "--poses", "boxes")
+    assert tables_of(output) == tracked_here(root, tmp_path / "repaired", "--poses", "boxes")
     names = ["00.parquet", "config.toml", "manifest.json", "plain.parquet"]
     assert sorted(path.name for path in output.iterdir()) == names
 

@@ -52,7 +52,7 @@ def test_the_presets_and_the_ends_of_the_sliders_are_within_their_ranges():
         for slider in (slider for sliders in THRESHOLDS.values() for slider in sliders):
             if slider.name in ranges:
                 for end in (slider.low, slider.high):
-                    assert ranges[slider.name].least <= end <= ranges[slider.name].most, slider.name
+                    assert ranges[slider.name].minimum <= end <= ranges[slider.name].maximum, slider.name
 
 
 def test_the_table_names_settings_that_there_are():

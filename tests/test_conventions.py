@@ -2,6 +2,7 @@
 
 import ast
 import dataclasses
+import functools
 import importlib
 import inspect
 import pathlib
@@ -18,19 +19,11 @@ PROJECT = ROOT.parent
 
 # Each layer may import those before it, and itself.
 LAYERS = [
-    {
-        "_version",
-        "_extras",
-        "_files",
-        "_interrupts",
-        "_padding",
-        "_box",
-        "_box_rows",
-        "config",
-        "types",
-        "geometry",
-        "xla",
-    },
+    # The standard library and NumPy alone.
+    {"_version", "_extras", "_files", "_interrupts", "_padding"},
+    {"config"},
+    # `_box` and `_box_rows` are parts of `types`: what one box, and what boxes of any kind, can do.
+    {"_box", "_box_rows", "types", "geometry", "xla"},
     {"stages"},
     {"detector"},
     {"tracking"},
@@ -67,6 +60,11 @@ def source_files():
     return sorted(ROOT.rglob("*.py"))
 
 
+def offenders(paths, rule):
+    """By file, what breaks a rule: `rule` lists it for one path."""
+    return {relative(path): found for path in paths if (found := rule(path))}
+
+
 def room_of(path):
     """The part of the package that a file belongs to: its top-level module or package."""
     return path.relative_to(ROOT).with_suffix("").parts[0]
@@ -74,7 +72,7 @@ def room_of(path):
 
 def imported_rooms(path):
     """Rooms of jaxbox that a file imports, with `from jaxbox import x` and relative imports resolved."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parsed(path)):
         names = []
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -97,13 +95,11 @@ def public_callables():
                 yield f"{module_name}.{name}", item
 
 
-@pytest.mark.parametrize("path", source_files(), ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_go_down_the_layers_only(path):
-    room = room_of(path)
-    if room in TOP:
-        return
-    wrong = set(imported_rooms(path)) - ALLOWED[room] - {room}
-    assert not wrong, f"{path.name} of {room} imports {sorted(wrong)}"
+def test_imports_go_down_the_layers_only():
+    def imports_upward(path):
+        return set(imported_rooms(path)) - ALLOWED[room_of(path)] - {room_of(path)}
+
+    assert offenders([path for path in source_files() if room_of(path) not in TOP], imports_upward) == {}
 
 
 def test_only_what_people_call_on_boxes_imports_by_name_and_so_past_the_layers():
@@ -111,6 +107,10 @@ def test_only_what_people_call_on_boxes_imports_by_name_and_so_past_the_layers()
     assert [relative(path) for path in importing] == ["_box_rows.py"]
     calls = {relative(path) for path in source_files() if "later_module(" in path.read_text()}
     assert calls == {"_box_rows.py", "types.py", "tracking/tracks.py"}
+
+
+def test_the_first_layer_imports_nothing_of_the_package():
+    assert not {room for room in LAYERS[0] for _ in imported_rooms(ROOT / f"{room}.py")}
 
 
 def test_every_room_has_a_layer():
@@ -186,16 +186,19 @@ def test_every_field_of_a_public_dataclass_is_documented(name, item):
             assert documented, f"{name}.{ast.unparse(statement.target)} has no documentation string under it"
 
 
-@pytest.mark.parametrize("path", source_files(), ids=lambda path: str(path.relative_to(ROOT)))
-def test_functions_are_short_and_modules_fit_a_screenful_of_screens(path):
-    text = path.read_text()
-    assert text.count("\n") < 500, f"{path.name} is too long: split it"
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.FunctionDef):
-            documented = ast.get_docstring(node) is not None
-            first = node.body[1] if documented and len(node.body) > 1 else node.body[0]
-            length = node.end_lineno - first.lineno + 1
-            assert length <= 60, f"{path.name}: {node.name} has {length} lines"
+def lines_of_body(function):
+    documented = ast.get_docstring(function) is not None
+    first = function.body[1] if documented and len(function.body) > 1 else function.body[0]
+    return function.end_lineno - first.lineno + 1
+
+
+def test_functions_and_modules_are_short():
+    def long_functions(path):
+        functions = [node for node in ast.walk(parsed(path)) if isinstance(node, ast.FunctionDef)]
+        return [function.name for function in functions if lines_of_body(function) > 60]
+
+    assert offenders(source_files(), long_functions) == {}
+    assert [path.name for path in source_files() if path.read_text().count("\n") >= 500] == []
 
 
 def test_the_version_is_the_same_everywhere():
@@ -256,8 +259,10 @@ def test_the_readme_names_both_commands():
 # What exists because of a compiler is in jaxbox.xla alone.
 
 STAGES = sorted((ROOT / "stages").glob("*.py"))
-PLAIN = sorted([*STAGES, *(ROOT / "geometry").glob("*.py"), ROOT / "detector.py"])
-"""Files that say what is computed, and nothing of how a compiler makes it fast."""
+METHOD = {"stages", "geometry", "detector", "tracking"}
+"""From the points to the tracks: they say what is computed, and nothing of how a compiler makes it fast."""
+COMPUTING = METHOD | {"config", "types", "evaluation", "synthetic"}
+"""Those, and all others with functions that are compiled."""
 
 LOOPS = {"while_loop", "fori_loop", "scan", "cond", "switch", "map"}
 FOR_A_COMPILER = {"platform_dependent", "optimization_barrier"}
@@ -283,6 +288,7 @@ def relative(path):
     return str(path.relative_to(ROOT))
 
 
+@functools.cache
 def parsed(path):
     return ast.parse(path.read_text())
 
@@ -338,6 +344,11 @@ def words_about(path):
             yield str(node.value.value)
 
 
+def names_in_file(names):
+    """A rule: which of some names a file reads or imports."""
+    return lambda path: names & set(names_in(parsed(path)))
+
+
 def constants(tree):
     """Names of a module's constants."""
     for node in tree.body:
@@ -348,6 +359,11 @@ def constants(tree):
                     yield name.id
 
 
+def of_rooms(rooms):
+    """Source files of some rooms."""
+    return [path for path in source_files() if room_of(path) in rooms]
+
+
 def outside(*places):
     """Source files of the package but those in some rooms, or of a name."""
     return [
@@ -355,40 +371,37 @@ def outside(*places):
     ]
 
 
-@pytest.mark.parametrize("path", outside("xla"), ids=relative)
-def test_loops_and_what_else_is_for_a_compiler_are_in_xla(path):
-    tree = parsed(path)
-    assert not set(names_of_lax(tree)) & LOOPS
-    if relative(path) != "run/export.py":  # It writes the programs of both platforms.
-        assert not set(names_in(tree)) & FOR_A_COMPILER
+def test_loops_and_what_else_is_for_a_compiler_are_in_xla():
+    assert offenders(outside("xla"), lambda path: set(names_of_lax(parsed(path))) & LOOPS) == {}
+    # It writes the programs of both platforms.
+    assert set(offenders(outside("xla"), names_in_file(FOR_A_COMPILER))) == {"run/export.py"}
 
 
-@pytest.mark.parametrize("path", outside("xla"), ids=relative)
-def test_only_xla_says_what_is_materialized(path):
-    assert "materialize" not in names_in(parsed(path))
+def test_only_xla_says_what_is_materialized():
+    assert offenders(outside("xla"), names_in_file({"materialize"})) == {}
 
 
-@pytest.mark.parametrize("path", outside("xla", "run"), ids=relative)
-def test_only_xla_and_run_ask_what_a_program_is_built_for(path):
-    assert "on_accelerator" not in names_in(parsed(path))
+def test_only_xla_and_run_ask_what_a_program_is_built_for():
+    assert offenders(outside("xla", "run"), names_in_file({"on_accelerator"})) == {}
 
 
-@pytest.mark.parametrize("path", PLAIN, ids=relative)
-def test_stages_do_nothing_with_bits_and_say_nothing_of_a_compiler(path):
-    assert list(bit_tricks(parsed(path))) == []
-    assert [words for words in words_about(path) if COMPILER_WORDS.search(words)] == []
+def test_bit_tricks_are_in_xla():
+    assert offenders(of_rooms(COMPUTING), lambda path: list(bit_tricks(parsed(path)))) == {}
 
 
-@pytest.mark.parametrize("path", outside("xla", "io", "cli"), ids=relative)
-def test_chunk_sizes_are_in_one_table(path):
+def test_the_method_says_nothing_of_a_compiler():
+    def about_a_compiler(path):
+        return [words for words in words_about(path) if COMPILER_WORDS.search(words)]
+
+    assert offenders(of_rooms(METHOD), about_a_compiler) == {}
+
+
+def test_chunk_sizes_are_in_one_table():
+    def chunk_sizes(path):
+        return [name for name in constants(parsed(path)) if CHUNK_SIZE.search(name)]
+
     # Those of `io` are of files, those of `cli` of pictures.
-    assert [name for name in constants(parsed(path)) if CHUNK_SIZE.search(name)] == []
-
-
-@pytest.mark.parametrize("path", sorted((ROOT / "xla").glob("*.py")), ids=relative)
-def test_chunk_sizes_of_xla_are_in_one_table_too(path):
-    found = [name for name in constants(parsed(path)) if CHUNK_SIZE.search(name)]
-    assert bool(found) == (path.name == "chunks.py")
+    assert set(offenders(outside("io", "cli"), chunk_sizes)) == {"xla/chunks.py"}
 
 
 @pytest.mark.parametrize(
@@ -431,10 +444,12 @@ def test_stages_pass_every_option_by_its_name(path):
             assert node.args.kwarg is None, ast.unparse(node)
 
 
-@pytest.mark.parametrize("path", outside("io"), ids=relative)
-def test_no_module_lists_the_names_of_fields(path):
+def test_no_module_lists_the_names_of_fields():
+    def lists_of_fields(path):
+        return [name for name in constants(parsed(path)) if name.endswith("_FIELDS")]
+
     # Those of `io` are of files.
-    assert [name for name in constants(parsed(path)) if name.endswith("_FIELDS")] == []
+    assert offenders(outside("io"), lists_of_fields) == {}
 
 
 def test_the_public_modules_at_the_root_are_the_types_and_the_pipeline():

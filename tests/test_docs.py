@@ -1,5 +1,6 @@
 """The documentation's hooks: what they make of docstrings and pages."""
 
+import importlib
 import importlib.util
 import pathlib
 import re
@@ -110,6 +111,58 @@ def test_the_pictures_of_the_tutorial_are_of_these_steps(tmp_path):
         assert drawn.shape == shown.shape
         # As above.
         assert np.any(drawn != shown, axis=-1).mean() < 0.001, "python examples/single_steps.py docs"
+
+
+ARCHITECTURE = (PROJECT / "docs" / "architecture.md").read_text()
+
+
+def test_the_calls_and_files_that_the_architecture_names_exist():
+    walks = re.findall(r"^## One (?:point|step).*?(?=^## )", ARCHITECTURE, re.MULTILINE | re.DOTALL)
+    calls = {name for walk in walks for cell in first_cells(walk) for name in re.findall(r"`([\w.]+)`", cell)}
+    assert {"ground.remove_ground", "association.associate"} <= calls
+    assert {name for name in calls if not is_known(name)} == set()
+    assert not is_known("scoring.detect")
+    files = set(re.findall(r"`((?:\w+/)+\w+\.py)`", ARCHITECTURE))
+    assert {"stages/ground.py", "tracking/association.py"} <= files
+    places = PROJECT, PROJECT / "jaxbox"
+    assert {name for name in files if not any((place / name).is_file() for place in places)} == set()
+
+
+def first_cells(text):
+    return [line.split("|")[1] for line in text.splitlines() if line.startswith("| ")]
+
+
+def is_known(name):
+    """Whether a dotted name is one of jaxbox, of a stage or of the tracker."""
+    module, _, attribute = name.removeprefix("jaxbox.").rpartition(".")
+    if hasattr(getattr(jaxbox, module, None) if module else jaxbox, attribute):
+        return True
+    homes = [f"jaxbox{home}.{module}" for home in ("", ".stages", ".tracking")]
+    found = [importlib.import_module(home) for home in homes if importlib.util.find_spec(home)]
+    return any(hasattr(home, attribute) for home in found)
+
+
+def anchors(page):
+    """Anchors of a page's headings, as the site and GitHub make them."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", heading.lower())) for heading in headings}
+
+
+def test_links_to_a_section_lead_to_one():
+    pages = [*(PROJECT / "docs").rglob("*.md"), PROJECT / "README.md"]
+    links = [
+        (page, link) for page in pages for link in re.findall(r"\]\(([^)\s]*#[^)\s]+)\)", page.read_text())
+    ]
+    broken = []
+    for page, link in links:
+        name, _, anchor = link.partition("#")
+        target = page.parent / name if name else page
+        # Sections of the API are made from its docstrings.
+        if target.is_file() and target.name != "api.md" and anchor not in anchors(target):
+            broken.append((page.name, link))
+    assert len(links) > 20
+    assert broken == []
 
 
 def test_the_pages_of_the_navigation_are_the_pages_that_exist():

@@ -139,7 +139,7 @@ def test_motion_leaves_what_is_straight_ahead_and_carries_the_sides_by_the_way_g
     # A quarter turn is a fortieth of a second: half a metre at 20 m/s, before or after.
     np.testing.assert_allclose(driven, [[10, 0, 0], [-0.5, 10, 0], [0.5, -10, 0]], atol=1e-5)
     turned, _ = corruptions.turn_during_sweep(xyz, np.zeros(3), 40.0, np.random.default_rng(0))
-    # One degree clockwise for what comes a quarter turn later, since the carrier turned left by it.
+    # One degree clockwise for what comes a quarter turn later, since the ego vehicle turned left by it.
     sin, cos = math.sin(math.radians(1)), math.cos(math.radians(1))
     expected = [[10, 0, 0], [10 * sin, 10 * cos, 0], [10 * sin, -10 * cos, 0]]
     np.testing.assert_allclose(turned, expected, atol=1e-5)

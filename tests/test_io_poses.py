@@ -187,7 +187,7 @@ def test_oxts_without_a_calibration_is_not_used_and_one_that_is_no_rotation_is_a
     folder = make_tracking(tmp_path, [oxts_line()] * 2, calibration=False)
     told = []
     assert io.find_poses(io.open_sweeps(folder), report=told.append) is None
-    assert "no calibration beside it says where the IMU is" in told[0]
+    assert "no calibration next to it says where the IMU is" in told[0]
     (tmp_path / "training" / "calib").mkdir()
     file = tmp_path / "training" / "calib" / "0000.txt"
     file.write_text("Tr_imu_velo 2 0 0 0 0 1 0 0 0 0 1 0\n")

@@ -34,7 +34,7 @@ def test_tilt_and_height_are_measured_whatever_they_are(roll, pitch):
     turn = rotation(roll, pitch)
     mounting = measure_mounting(SWEEP.xyz @ turn.T)
     true_tilt = np.degrees(np.arccos(turn[2, 2]))
-    assert mounting.tilt_deg == pytest.approx(true_tilt, abs=0.5)
+    assert mounting.tilt_deg == pytest.approx(true_tilt, abs=0.2)
     assert mounting.height_m == pytest.approx(SENSOR_HEIGHT_M, abs=0.1)
     # Upright again: the ground's normal, and no turn about it.
     residual = mounting.T_level_points[:3, :3] @ turn @ [0, 0, 1]

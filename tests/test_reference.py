@@ -832,7 +832,7 @@ def test_cars_on_flat_ground_are_found_where_they_stand(car_scene):
         # It reads no shorter than it is, but sides seen whole are taken to.
         assert detections.size[row, 0] == pytest.approx(length, abs=0.3)
         np.testing.assert_allclose(detections.size[row, 1:], [width, height], atol=0.1)
-        assert np.degrees(detections.yaw[row]) == pytest.approx(np.degrees(yaw), abs=2)
+        assert np.degrees(detections.yaw[row]) == pytest.approx(np.degrees(yaw), abs=1.1)
         own = sweep[detections.point_detection == row]
         assert len(own) == detections.num_points[row] > 30
         outside = reference.distance_outside(own[:, :2], np.array([x, y, length, width, yaw]))
@@ -845,7 +845,7 @@ def test_a_truck_is_called_a_truck_and_a_car_is_not():
     for label, body in ((Label.TRUCK, truck), (Label.CAR, CARS[1])):
         row = np.argmin(np.hypot(*(detections.center[:, :2] - body[:2]).T))
         assert detections.label[row] == label
-        np.testing.assert_allclose(detections.center[row, :2], body[:2], atol=0.5)
+        np.testing.assert_allclose(detections.center[row, :2], body[:2], atol=0.3)
         # A cuboid reads no shorter than it is, but sides seen whole are taken to.
         np.testing.assert_allclose(detections.size[row, :2], body[2:4], atol=0.3)
 

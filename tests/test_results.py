@@ -84,7 +84,7 @@ def test_boxes_are_chosen_as_numpy_chooses(found):
         (np.ones(2, bool), IndexError, "one value a box"),
         ("car", TypeError, r"\.of\(.car.\)"),
         (0.5, TypeError, r"\.above"),
-        (np.zeros((1, 1), int), TypeError, "no index"),
+        (np.zeros((1, 1), int), TypeError, "not an index"),
     ],
 )
 def test_what_is_no_box_is_refused_in_words(found, index, error, text):

@@ -124,7 +124,7 @@ def test_info_advises_to_level_what_is_tilted_or_seen_from_the_ground(pitch_deg,
     pitch = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
     xyz = synthetic.make_sweep(2, num_azimuths=400).xyz @ pitch.T + np.array([0, 0, up_m])
     info, _ = fits(xyz)
-    assert info.tilt_deg == pytest.approx(pitch_deg, abs=0.5)
+    assert info.tilt_deg == pytest.approx(pitch_deg, abs=0.2)
     assert sweep_info.advised_options([info], 64) == options
 
 

@@ -105,7 +105,7 @@ def test_a_turned_car_is_found_turned():
         xyz = np.column_stack([sides @ turn.T + center, np.linspace(-1.6, -0.2, 90)])
         boxes = jaxbox.fit_boxes(xyz, np.full(90, 7))
         assert boxes.cluster.tolist() == [7]
-        assert np.degrees(boxes.yaw[0]) == pytest.approx(degrees, abs=1.0)
+        assert np.degrees(boxes.yaw[0]) == pytest.approx(degrees, abs=0.6)
         np.testing.assert_allclose(boxes.size[0], [4, 2, 1.4], atol=0.1)
         np.testing.assert_allclose(boxes.center[0], [*center, -0.9], atol=0.1)
 

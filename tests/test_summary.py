@@ -57,12 +57,12 @@ def test_boxes_are_those_from_the_cut_on(found):
         keep = detections.valid & (detections.score >= cut)
         assert result.num_boxes == keep.sum() == sum(result.boxes.values())
         assert result.num_boxes > 0
-        assert result.score.least == pytest.approx(detections.score[keep].min())
-        assert result.score.least >= cut
+        assert result.score.minimum == pytest.approx(detections.score[keep].min())
+        assert result.score.minimum >= cut
         assert result.length_m.median == pytest.approx(np.median(detections.size[keep, 0]))
-        assert result.width_m.greatest == pytest.approx(detections.size[keep, 1].max())
-        assert result.height_m.least == pytest.approx(detections.size[keep, 2].min())
-        assert result.range_m.least == pytest.approx(
+        assert result.width_m.maximum == pytest.approx(detections.size[keep, 1].max())
+        assert result.height_m.minimum == pytest.approx(detections.size[keep, 2].min())
+        assert result.range_m.minimum == pytest.approx(
             np.linalg.norm(detections.center[keep, :2], axis=1).min()
         )
     assert jaxbox.summarise(detections).min_score == jaxbox.DEFAULT_SCORE_THRESHOLD

@@ -26,7 +26,7 @@ cached = functools.cache(make_sequence)
 
 
 def drive_of(kind, seed, turns):
-    return cached(seed, kind=kind, carrier_turns=turns, **COARSE)
+    return cached(seed, kind=kind, ego_turns=turns, **COARSE)
 
 
 drives = pytest.mark.parametrize(("kind", "seed", "turns"), DRIVES)
@@ -315,7 +315,7 @@ def footprint(mover, state, index):
 @drives
 def test_nobody_touches_anybody(kind, seed, turns):
     traffic = drive_of(kind, seed, turns).traffic
-    movers = [traffic.carrier, *traffic.vehicles]
+    movers = [traffic.ego, *traffic.vehicles]
     times = np.arange(0.0, 20.0, 0.125)
     states = [mover.trajectory.at(times) for mover in movers]
     radius = [np.hypot(*mover.size[:2]) / 2 for mover in movers]
@@ -347,7 +347,7 @@ def test_nobody_drives_through_what_stands_around(kind, seed, turns):
     grid = (
         np.array(np.meshgrid([-0.5, -0.25, 0, 0.25, 0.5], [-0.5, 0, 0.5], [0.1, 0.5, 1.0])).reshape(3, -1).T
     )
-    for mover in [traffic.carrier, *traffic.vehicles[:12]]:
+    for mover in [traffic.ego, *traffic.vehicles[:12]]:
         state = mover.trajectory.at(np.arange(0.0, 15.0, 0.3))
         corner = grid * mover.size
         c, s = np.cos(state.heading)[:, None], np.sin(state.heading)[:, None]
@@ -455,7 +455,7 @@ def test_the_stream_reads_a_sequence():
         ({"rate_hz": 0.0}, "rate_hz 0.0"),
         ({"rate_hz": float("nan")}, "nan"),
         ({"num_sweeps": 4000}, "400 s"),
-        ({"kind": "highway", "carrier_turns": True}, "carrier_turns"),
+        ({"kind": "highway", "ego_turns": True}, "ego_turns"),
         ({"num_beams": 0}, "num_beams"),
         ({"dropout": 2.0}, "dropout"),
     ],

@@ -658,7 +658,7 @@ def test_a_track_that_is_missed_lives_as_long_as_it_is_told_or_was_seen(hidden, 
 def test_a_car_that_drives_is_known_by_its_velocity_and_front():
     state = start()
     for index in range(25):
-        # It drives backwards along x, and the carrier forwards at 5 m/s.
+        # It drives backwards along x, and the ego vehicle forwards at 5 m/s.
         place = [30.0 - 1.0 * index - 0.5 * index, 4.0]
         state, tracks = step(state, cars([place]), 0.1, traffic.pose(0.5).astype(np.float32))
     assert tracks.id[0] == 0

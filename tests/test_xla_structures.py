@@ -3,6 +3,7 @@
 import functools
 import itertools
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -485,4 +486,4 @@ def test_no_chunk_size_changes_a_result(factor, monkeypatch):
     before = results()
     for name in ("FOLDED_POINTS", "RUN_BLOCKS", "MINIMA_TABLES"):
         monkeypatch.setattr(chunks, name, int(factor * getattr(chunks, name)))
-    jax.tree.map(np.testing.assert_array_equal, results(), before)
+    chex.assert_trees_all_equal(results(), before)

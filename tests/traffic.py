@@ -95,15 +95,15 @@ def drive(start, yaw, speed, turn_rate, times, *, stops=False, lane_m=0.0):
 
 
 def simulate(seed, num_sweeps=NUM_SWEEPS, dt=0.1, num_cars=14, capacity=CAPACITY) -> Recording:
-    """Cars that drive, turn, stop and stand, seen from a carrier that turns, with all that goes wrong.
+    """Cars that drive, turn, stop and stand, seen from an ego vehicle that turns, with all that goes wrong.
 
     Noise, quarter turns of boxes, misses, false alarms, and a wall that hides some of them.
     """
     rng = np.random.default_rng(seed)
     steps = (dt * rng.uniform(0.9, 1.1, num_sweeps)).astype(np.float32)
     times = np.cumsum(steps.astype(float))
-    carrier = drive((0, 0), 0.3, 8.0, 0.2 * np.sin(times), times)
-    poses = [pose(x, y, yaw, 0.02 * i) for i, (x, y, yaw, _) in enumerate(carrier)]
+    ego = drive((0, 0), 0.3, 8.0, 0.2 * np.sin(times), times)
+    poses = [pose(x, y, yaw, 0.02 * i) for i, (x, y, yaw, _) in enumerate(ego)]
     cars = [
         drive(
             rng.uniform(-40, 40, 2),

@@ -28,7 +28,7 @@ from jaxbox.config.fields import all_fields
 from jaxbox.io.drive_records import DriveRecords
 from jaxbox.io.poses import choose_poses
 from jaxbox.io.results import SweepResult
-from jaxbox.run.carrier import without_points
+from jaxbox.run.pose_providers import without_points
 from jaxbox.run.tracking import TrackedSweep, smooth_tracks, track
 from jaxbox.tracking.poses import Poses, PoseSource
 from jaxbox.tracking.trails import Trails
@@ -52,7 +52,7 @@ class TrackOptions(RunOptions):
     smooth: bool
     """Whether the whole drive is looked at before anything is written."""
     confirmed: bool
-    """Whether tracks that are not confirmed are left out."""
+    """Whether only confirmed tracks are written."""
     coasting: bool
     """Whether KITTI text holds tracks too that were not detected in the sweep."""
     points: bool

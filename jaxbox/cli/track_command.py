@@ -28,7 +28,7 @@ from jaxbox.cli.track import TrackOptions, run_track
 from jaxbox.cli.track_ray import TrackRayOptions, run_track_ray
 from jaxbox.cli.track_results import TrackFormat
 from jaxbox.io.poses import AUTO
-from jaxbox.run.carrier import ESTIMATED
+from jaxbox.run.pose_providers import ESTIMATED
 from jaxbox.run.tracking import MAX_TRACKS, RATE_HZ
 
 TRACK_EXAMPLES = """Examples:

@@ -25,7 +25,7 @@ class TrackRayOptions(RayOptions):
     smooth: bool
     """Whether the whole drive is looked at before anything is written."""
     confirmed: bool
-    """Whether tracks that are not confirmed are left out."""
+    """Whether only confirmed tracks are written."""
     coasting: bool
     """Whether KITTI text was to hold all tracks; Parquet does."""
     video: bool

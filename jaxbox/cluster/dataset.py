@@ -87,13 +87,13 @@ def detect_dataset(
         cache_folders=CacheFolders.of_this_process(),
         versions=versions(formats=True),
     )
-    divide = functools.partial(cut, size=sweeps_per_partition)
+    divide = functools.partial(partition_sweeps, size=sweeps_per_partition)
     with joined_ray(address, workers, cpus_per_worker) as ray:
         run = Run(task, DetectWorker, divide, listed(sources), ray, cpus_per_worker)
         return run.run(workers, resume, on_report)
 
 
-def cut(refs: Sequence[SweepRef], size: int) -> Iterator[tuple[str, Sequence[SweepRef]]]:
+def partition_sweeps(refs: Sequence[SweepRef], size: int) -> Iterator[tuple[str, Sequence[SweepRef]]]:
     """Cuts sweeps into partitions.
 
     Args:
@@ -103,7 +103,7 @@ def cut(refs: Sequence[SweepRef], size: int) -> Iterator[tuple[str, Sequence[Swe
     Yields:
       Name and sweeps.
 
-    >>> [name for name, _ in cut([SweepRef("a", "a.bin")] * 3, 2)]
+    >>> [name for name, _ in partition_sweeps([SweepRef("a", "a.bin")] * 3, 2)]
     ['part-000000', 'part-000001']
     """
     for number, first in enumerate(range(0, len(refs), size)):

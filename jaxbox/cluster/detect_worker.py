@@ -81,7 +81,7 @@ class DetectWorker(PartitionWorker[DetectTask, PartitionReport]):
         self, refs: Sequence[SweepRef], attempt: Attempt, report: PartitionReport
     ) -> Iterator[tuple[_Read, Detections | None]]:
         """Each sweep in order; the next batch is read while one is computed."""
-        size, lead = (1, 0) if attempt.careful else (self._task.batch, 1)
+        size, lead = (1, 0) if attempt.one_by_one else (self._task.batch, 1)
         batches = [refs[first : first + size] for first in range(0, len(refs), size)]
         for _, reading in ahead(batches, lambda batch: self._begin(batch, attempt), lead):
             reads = [future.result() for future in reading]
@@ -97,7 +97,7 @@ class DetectWorker(PartitionWorker[DetectTask, PartitionReport]):
                 start = time.perf_counter()
 
     def _begin(self, refs: Sequence[SweepRef], attempt: Attempt) -> list[Future[_Read]]:
-        if attempt.careful:
+        if attempt.one_by_one:
             attempt.begin(refs[0].name)
         return [self._threads.submit(self._read, ref, attempt.gives_up(ref.name)) for ref in refs]
 

@@ -14,7 +14,7 @@ from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.config.checks import check_config
 from jaxbox.io.poses import AUTO
 from jaxbox.run.cache import CacheFolders
-from jaxbox.run.carrier import ESTIMATED, Clock, estimated_source, make_carrier
+from jaxbox.run.pose_providers import ESTIMATED, Clock, estimated_source, make_pose_provider
 from jaxbox.run.tracking import MAX_TRACKS, RATE_HZ
 from jaxbox.run.versions import versions
 
@@ -53,13 +53,13 @@ def track_dataset(
       track_config: the tracker's settings; None for the defaults.
       poses: "auto" for what the data set or recording holds, else kiss-icp (extra ``track``) where this
         process has it, else the boxes; "kiss-icp", "boxes" or "none"; or a file, or a folder with one a
-        drive, on a disk that all nodes have. Poses beside points at URLs are not fetched, so "auto"
+        drive, on a disk that all nodes have. Poses next to points at URLs are not fetched, so "auto"
         estimates there.
       rate_hz: sweeps a second, where nothing says when they were taken.
       max_tracks: capacity for vehicles at a time.
       smooth: whether each drive is smoothed, `jaxbox.run.tracking.smooth_tracks`, before it is written.
-      confirmed: whether tracks that are not confirmed are left out.
-      min_score: tracks with lower scores are left out.
+      confirmed: whether only confirmed tracks are written.
+      min_score: tracks with lower scores are not written.
       capacity: points that every sweep is padded to; None for the bucket that holds it.
       topic: of the points in recordings of several.
       address: as `detect_dataset`.
@@ -113,7 +113,7 @@ def _checked_poses(asked: str, sources: Sequence[str]) -> str:
         return asked
     if asked in ESTIMATED:
         # Without what it needs every drive would fail.
-        make_carrier(asked)
+        make_pose_provider(asked)
         return asked
     if remote := [source for source in sources if is_remote(source)]:
         raise io.InputError(

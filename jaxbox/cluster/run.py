@@ -1,4 +1,4 @@
-"""A run over an archive: its driver, which lists sweeps, hands out partitions and keeps the account."""
+"""A run over an archive: its driver, which lists sweeps, hands out partitions and writes the manifest."""
 
 import concurrent.futures
 import contextlib
@@ -25,11 +25,11 @@ from jaxbox.cluster.worker import REPORT_KEY, SUFFIX, Partition, PartitionWorker
 from jaxbox.config.fields import config_from_toml, config_to_toml, differing_names, recorded_options
 
 MANIFEST = "manifest.json"
-"""The account of a run, next to its partitions."""
+"""What became of each sweep of a run, next to its partitions."""
 CONFIG = "config.toml"
 """The exact settings, next to its partitions."""
-_LOOKERS = 16
-"""Threads that look at the partitions of an earlier run: each look waits for the file system."""
+_NUM_READERS = 16
+"""Threads that read the reports of an earlier run: each read waits for the file system."""
 CLUSTERS_VARIABLE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
 """Environment variable without which Ray takes the loopback address for its machine's, on any system."""
 _STORE_BYTES = 2**28
@@ -197,7 +197,7 @@ class Run(Generic[AnyReport]):
             workers = max(1, int(cores) // self.cpus_per_worker)
         refs = list_sweeps(self.inputs, self.task.topic, self._in_parallel)
         partitions = plan(self.task, self.divide(refs))
-        kept = self._look(partitions, resume)
+        kept = self._finished_reports(partitions, resume)
         missing = [partition for partition in partitions if partition.name not in kept]
         # What takes longest begins first, so that the workers end together.
         missing.sort(key=lambda partition: -len(partition.refs))
@@ -210,7 +210,7 @@ class Run(Generic[AnyReport]):
         self._store.remove_partials()
         self._forget_attempts()
         self._store.write_text(CONFIG, config_to_toml(self.task.config))
-        self._account(report, finished=False)
+        self._write_manifest(report, finished=False)
         try:
             # Closed immediately on an early exit, so that Ray ends the workers.
             with contextlib.closing(self._results(missing, min(workers, max(1, len(missing))))) as results:
@@ -225,7 +225,7 @@ class Run(Generic[AnyReport]):
             report.partitions = [reports[p.name] for p in partitions if p.name in reports]
             report.elapsed_s = time.perf_counter() - start
             whole = len(report.partitions) == len(partitions) and not report.failures
-            self._account(report, finished=whole)
+            self._write_manifest(report, finished=whole)
         return report
 
     def _forget_attempts(self) -> None:
@@ -244,7 +244,7 @@ class Run(Generic[AnyReport]):
         except self.ray.exceptions.RayTaskError as error:
             raise error.cause if isinstance(error.cause, io.InputError | OSError) else error from error
 
-    def _look(self, partitions: list[Partition], resume: bool) -> dict[str, AnyReport]:
+    def _finished_reports(self, partitions: list[Partition], resume: bool) -> dict[str, AnyReport]:
         """Reports of the partitions that need not be done again."""
         there = {name for name in self._store.names() if name.endswith(SUFFIX)}
         if not there:
@@ -261,7 +261,7 @@ class Run(Generic[AnyReport]):
             )
         self._check_resumable()
         candidates = [partition for partition in partitions if partition.file in there]
-        with concurrent.futures.ThreadPoolExecutor(_LOOKERS) as threads:
+        with concurrent.futures.ThreadPoolExecutor(_NUM_READERS) as threads:
             found = threads.map(self._earlier_report, candidates)
             return {report.name: report for report in found if report is not None}
 
@@ -316,7 +316,7 @@ class Run(Generic[AnyReport]):
         except self.ray.exceptions.RayError as error:
             raise ClusterError(f"Ray could not go on: {error}") from error
 
-    def _account(self, report: DatasetReport[AnyReport], *, finished: bool) -> None:
+    def _write_manifest(self, report: DatasetReport[AnyReport], *, finished: bool) -> None:
         """Writes the manifest."""
         account = {
             "finished": finished,

@@ -181,7 +181,7 @@ def group_refs(refs: Sequence[SweepRef]) -> list[tuple[str, tuple[SweepRef, ...]
     [('day', 1)]
     """
     sweeps = [listed_sweep(ref) for ref in refs]
-    # Beside recordings, files of different folders may have one name.
+    # Where there are recordings too, files of different folders may have one name.
     refs_of = {(sweep.points_path, sweep.name): ref for sweep, ref in zip(sweeps, refs, strict=True)}
     groups = io.group_sequences(sweeps)
     return [(name, tuple(refs_of[item.points_path, item.name] for item in group)) for name, group in groups]

@@ -15,7 +15,7 @@ from jaxbox.config.fields import all_fields
 from jaxbox.io.drive_records import DriveRecords
 from jaxbox.io.parquet import TRACK_COLUMNS
 from jaxbox.io.poses import AUTO, choose_poses
-from jaxbox.run.carrier import without_points
+from jaxbox.run.pose_providers import without_points
 from jaxbox.run.tracking import TrackedSweep, smooth_tracks, track
 from jaxbox.tracking.poses import Poses, PoseSource
 
@@ -40,7 +40,7 @@ class TrackTask(Task):
     smooth: bool
     """Whether the whole drive is looked at before anything is written."""
     confirmed: bool
-    """Whether tracks that are not confirmed are left out."""
+    """Whether only confirmed tracks are written."""
 
     @property
     def options(self) -> dict[str, Any]:
@@ -118,7 +118,7 @@ class TrackWorker(PartitionWorker[TrackTask, DriveReport]):
     def _poses(self, partition: Partition, sweeps: Sequence[Any], report: DriveReport) -> Poses | PoseSource:
         asked, tell = self._task.poses, report.notes.append
         if asked == AUTO and is_remote(partition.refs[0].url):
-            tell("Poses are estimated: those beside points at a URL are not fetched.")
+            tell("Poses are estimated: those next to points at a URL are not fetched.")
             return self._task.estimator
         found = choose_poses(sweeps, asked, report=tell, warn=tell)
         return self._task.estimator if found is None else found

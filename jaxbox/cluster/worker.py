@@ -101,7 +101,7 @@ class Attempt:
         self.begin(None)
 
     @property
-    def careful(self) -> bool:
+    def one_by_one(self) -> bool:
         """Whether to go sweep by sweep."""
         return self.num_before > 0
 

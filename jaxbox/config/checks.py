@@ -14,7 +14,7 @@ from jaxbox.config.tracking import TrackConfig
 
 
 def check_config(config: DetectorConfig) -> None:
-    """Refuses settings that cannot be meant.
+    """Rejects invalid settings.
 
     Args:
       config: of the detector. Thresholds that are being traced have no values yet, and are not looked at.
@@ -49,7 +49,7 @@ def check_ranges(config: DetectorConfig | TrackConfig) -> None:
     values, structure = jax.tree.flatten(config)
     for (name, allowed), value in zip(_thresholds(structure), values, strict=True):
         # Most are such floats: this is part of every call of `detect`.
-        if type(value) is float and allowed.least <= value <= allowed.most:
+        if type(value) is float and allowed.minimum <= value <= allowed.maximum:
             continue
         if not isinstance(value, jax.core.Tracer):
             checked_number(name, jax.device_get(value), allowed)
@@ -64,7 +64,7 @@ def _thresholds(structure: Any) -> list[tuple[str, Range]]:
         _check_grids(config)
     ranges = traced_ranges(config)
     for name, value in traced_fields(config).items():
-        # None is no leaf to JAX.
+        # JAX does not count None as a leaf.
         if value is None:
             checked_number(name, value, ranges[name])
     return list(ranges.items())

@@ -1,7 +1,7 @@
 """Which numbers each setting takes: the one table of ranges, by dotted name.
 
-A number outside finds nothing, or divides by zero, and compiled code could not say so. Whoever takes settings
-looks here: `replace_fields` for files and the command line, `check_config` for what Python hands to `detect`.
+A number outside finds nothing, or divides by zero, and compiled code could not say so. Two functions check
+against it: `replace_fields` for files and the command line, `check_config` for what Python hands to `detect`.
 """
 
 import dataclasses
@@ -20,16 +20,16 @@ MAX_SHOWN = 80
 
 
 class ConfigError(ValueError):
-    """Settings that cannot be meant; the message names the setting and what it takes."""
+    """Invalid settings; the message names the setting and what it takes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """The numbers that a setting takes, from `least` to `most`."""
+    """The numbers that a setting takes, from `minimum` to `maximum`."""
 
-    least: float
+    minimum: float
     """Smallest number."""
-    most: float
+    maximum: float
     """Largest number."""
     text: str
     """In words, for errors and the documentation."""
@@ -63,7 +63,7 @@ _POSITIVE = """
     vehicles.classes.count_max_height_m
     vehicles.saturation_points vehicles.support_points vehicles.recess_share
     vehicles.free_scale vehicles.objective_softness
-    gate acceleration_mps2 position_sd_m birth_speed_sd_mps max_gap_s max_carrier_speed_mps
+    gate acceleration_mps2 position_sd_m birth_speed_sd_mps max_gap_s max_ego_speed_mps
 """
 """Divisors, and what leaves nothing to find at zero. Zero for a map's greatest height turns the map off."""
 
@@ -119,17 +119,17 @@ def checked_number(name: str, value: Any, allowed: Range) -> float:
       The number.
 
     Raises:
-      ConfigError: for what is no single number, or is outside the range; NaN is outside all.
+      ConfigError: for anything but a single number in the range; NaN is in none.
 
     >>> checked_number("vehicles.min_score", 0.5, SHARE)
     0.5
     """
     try:
         number = math.nan if isinstance(value, bool | str) else float(value)
-    # TypeError for what is no number, OverflowError for a whole number of hundreds of digits.
+    # TypeError for anything but a number, OverflowError for a whole number of hundreds of digits.
     except (TypeError, ValueError, OverflowError):
         number = math.nan
-    if not allowed.least <= number <= allowed.most:
+    if not allowed.minimum <= number <= allowed.maximum:
         raise ConfigError(f"{name} is {shown(value)}; it must be {allowed.text}.")
     return number
 

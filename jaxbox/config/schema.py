@@ -110,14 +110,14 @@ class GroundConfig:
     band_above_grade: Scalar = 0.06
     """Growth of that band with range, m/m."""
     blind_radius_m: Scalar = 2.5
-    """Points nearer than this are the carrier vehicle, not ground."""
+    """Points nearer than this are the ego vehicle, not ground."""
     envelope_margin_m: Scalar = 0.1
     """A cell minimum within this of the lower envelope is ground."""
     min_support_share: Scalar = 0.05
     """Ground has, within 3 m, at least this share of the points up to 1.2 m above it at about its height
     (.1 to .2 m); what lies below is a reflection. 0 asks for none."""
     min_support_points: Scalar = 2.0
-    """And at least so many points."""
+    """And at least this many points."""
     smoothing_m: Scalar = 1.0
     """Standard deviation of the Gaussian that smooths the ground grid (and fills it, 4 x wider)."""
     min_height_m: Scalar = 0.2
@@ -184,7 +184,7 @@ class EvidenceConfig:
     range_cell_m: float = _static(default=0.25)
     """static: length of a range cell."""
     min_range_m: Scalar = 2.0
-    """Nearer returns are the carrier vehicle."""
+    """Nearer returns are the ego vehicle."""
     hit_min_height_m: Scalar = 0.3
     """A return between these heights is a hit."""
     hit_max_height_m: Scalar = 1.2
@@ -258,7 +258,7 @@ class CompletionConfig:
     """static: let the evidence also judge the rectangle along the scene's direction, where that is not
     the best rotation by itself; needs ``box.scene_direction``."""
     seen_length: Scalar = 0.72
-    """A side measured at least so long, as a fraction of the class's length, may be seen whole."""
+    """A side measured at least this long, as a fraction of the class's length, may be seen whole."""
     seen_width: Scalar = 0.83
     """As ``seen_length``, for the width."""
     seen_weight: Scalar = 0.8

@@ -9,12 +9,12 @@ class TrackConfig:
     """How detections of successive sweeps become tracks; see `jaxbox.tracking`."""
 
     birth_score: Scalar = 0.02
-    """A detection that belongs to no track begins one from this score on: far below that of a vehicle, as a
-    track's score is its mean, and what a single sweep answers is not to be lost."""
+    """A detection that belongs to no track begins one from this score on. It is low, because a track's score
+    is the mean of its detections, and a vehicle that is seen in one sweep only should not be lost."""
     high_score: Scalar = 0.1
     """Detections from this score on are matched first (ByteTrack: two stages),"""
     low_score: Scalar = 0.01
-    """and then those from this one on; lower ones are left out."""
+    """and then those from this one on; lower ones are ignored."""
     gate: Scalar = 16.0
     """Largest squared Mahalanobis distance between a track and its detection, with 2 degrees of freedom."""
     acceleration_mps2: Scalar = 3.0
@@ -61,5 +61,5 @@ class TrackConfig:
     """where its course at both ends agrees within this."""
     max_gap_s: Scalar = 1.0
     """All tracks end where the next sweep comes later than this, s."""
-    max_carrier_speed_mps: Scalar = 70.0
-    """A carrier that moves faster than this, m/s, has a wrong pose, and all tracks end."""
+    max_ego_speed_mps: Scalar = 70.0
+    """Above this ego speed, m/s, the pose is taken to be wrong, and all tracks end."""

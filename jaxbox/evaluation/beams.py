@@ -37,7 +37,7 @@ def beam_of_points(xyz: np.ndarray) -> np.ndarray:
     azimuth = np.arctan2(xyz[finite, 1].astype(np.float64), xyz[finite, 0]) % (2 * np.pi)
     step = np.diff(azimuth, prepend=azimuth[:1])
     direction = -1.0 if np.sum(step > 0) < np.sum(step < 0) else 1.0
-    # Back by a turn is a new beam; forth again by a turn was no new beam after all.
+    # A jump back by a turn is a new beam, unless the next jump goes forward by a turn.
     turns = np.cumsum((direction * step < -_MIN_BACK_RAD).astype(int) - (direction * step > _MIN_BACK_RAD))
     beam = np.zeros(len(xyz), int)
     beam[finite] = np.maximum.accumulate(turns) if len(turns) else 0

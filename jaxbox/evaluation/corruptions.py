@@ -28,7 +28,8 @@ BACKSCATTER_SHARE = 0.3
 """Of the beams that fog takes, the share that come back from the fog itself."""
 
 MIN_RANGE_M = 2.0
-"""No spurious return is nearer: an HDL-64E reports none nearer than 0.9 m, and the carrier is excluded."""
+"""Spurious returns are at least this far: an HDL-64E reports none nearer than 0.9 m, and the ego vehicle
+is excluded."""
 
 ROAD_BELOW_M = 1.3
 """What lies lower than this below the sensor is taken for road, for sensors at about 1.7 m."""
@@ -92,7 +93,7 @@ def add_range_noise(xyz: np.ndarray, intensity: np.ndarray, std_m: float, rng: n
 
 
 def add_fog(xyz: np.ndarray, intensity: np.ndarray, visibility_m: float, rng: np.random.Generator) -> Points:
-    """Weakens returns by fog, loses the too weak, and lets some of those come back from the fog.
+    """Weakens returns by fog, loses those that are too weak, and lets some of them come back from the fog.
 
     A return from R has the power rho / R^2 exp(-2 alpha R), with alpha = ln(20) / visibility (Koschmieder;
     Hahner et al.), and is seen where that is at least 1 / REACH_M^2. What was seen in clear air had a
@@ -172,10 +173,10 @@ def reflect_below_road(
 def drive_during_sweep(
     xyz: np.ndarray, intensity: np.ndarray, speed_m_s: float, rng: np.random.Generator
 ) -> Points:
-    """Distorts a sweep as if the sensor drove straight on while it turned, and nobody undid it.
+    """Distorts a sweep as if the sensor drove straight on while it turned, without compensation.
 
     A point at azimuth phi is seen phi / 2 pi of a period after the sensor looked straight ahead, and then is
-    nearer by the way gone. The distortion comes on top of what the recording has.
+    nearer by the distance driven. The distortion comes on top of what the recording has.
 
     Args:
       xyz: (n, 3) m.
@@ -194,7 +195,7 @@ def drive_during_sweep(
 def turn_during_sweep(
     xyz: np.ndarray, intensity: np.ndarray, rate_deg_s: float, rng: np.random.Generator
 ) -> Points:
-    """Distorts a sweep as if the sensor's carrier turned meanwhile, see `drive_during_sweep`.
+    """Distorts a sweep as if the ego vehicle turned meanwhile, see `drive_during_sweep`.
 
     Args:
       xyz: (n, 3) m.

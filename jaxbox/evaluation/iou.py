@@ -64,7 +64,7 @@ def paired_overlaps(boxes_a: np.ndarray, boxes_b: np.ndarray) -> tuple[np.ndarra
     if boxes_a.shape != boxes_b.shape or boxes_a.ndim != 2 or boxes_a.shape[1] != 7:
         raise ValueError(f"the boxes have shapes {boxes_a.shape} and {boxes_b.shape}; both must be (P, 7).")
     num_pairs = len(boxes_a)
-    capacity = max(_MIN_PAIRS, 1 << max(num_pairs - 1, 0).bit_length())
+    capacity = max(_MIN_PAIRS, 2 ** max(num_pairs - 1, 0).bit_length())
     padded = np.zeros((2, capacity, 7), np.float32)
     # Relative to one of the two in float64, because float32 keeps only centimetres of map coordinates.
     padded[0, :num_pairs] = boxes_a

@@ -23,7 +23,7 @@ NEIGHBOURS: Mapping[str, tuple[str, ...]] = {
     "car": tuple(label.word for label in Label if label is not Label.CAR),
     "pedestrian": ("person_sitting",),
 }
-"""Classes too alike to call a detection of the first one wrong; KITTI itself leaves out Truck."""
+"""Classes too alike to call a detection of the first one wrong; KITTI itself does not list Truck."""
 
 RATE_OVERLAPS = (0.5, 0.7)
 RANGE_EDGES_M = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
@@ -171,7 +171,7 @@ def _excused(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -
 
 
 def cut(scenes: Sequence[Scene], *, min_score: float) -> list[Scene]:
-    """Leaves out detections below a score.
+    """Removes detections below a score.
 
     Args:
       scenes: the frames.
@@ -201,7 +201,7 @@ def match(overlap: np.ndarray, counts: np.ndarray, *, min_overlap: float) -> np.
     Args:
       overlap: (A, B) in [0, 1].
       counts: (A,) bool: labels that count.
-      min_overlap: a match needs at least so much, and more than 0.
+      min_overlap: a match needs at least this much, and more than 0.
 
     Returns:
       (A,) int: detection of each label, -1 where it has none.

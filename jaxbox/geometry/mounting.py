@@ -12,7 +12,8 @@ import numpy as np
 from jaxbox.types import GROUND_ABOVE_M
 
 NEAR_M, FAR_M = 3.0, 30.0
-"""The ground is fitted to points so far away: nearer ones are the carrier, farther ones other roads."""
+"""The ground is fitted to points at these ranges: nearer ones are the ego vehicle, farther ones
+other roads."""
 MAX_TILT_DEG = 35.0
 """A steeper plane is a wall, or z is not up."""
 MIN_SENSOR_HEIGHT_M = 0.7

@@ -84,7 +84,7 @@ def rectangle_intersection(box_a: jax.Array, box_b: jax.Array) -> jax.Array:
 
     In the frame of b, where b is the window |x| <= L, |y| <= W, Green's theorem gives the area as
     -sum over the edges of a of the integral of clamp(y, -W, W) dx over |x| <= L. Unlike clipping
-    polygons it needs no sorting, and it is continuous: coincident edges and equal boxes are no special case.
+    polygons it needs no sorting, and it is continuous: coincident edges and equal boxes need no special case.
 
     Args:
       box_a: (5,) float, m and rad: x, y, length, width, yaw. Sizes are not negative.

@@ -125,7 +125,7 @@ def log_sensor_xyz_m(path: str | os.PathLike[str]) -> np.ndarray:
       path: a table, ``LOG/sensors/lidar/*.feather`` where it is a sweep of the data set.
 
     Returns:
-      (3,) float64, m: by the log's calibration, or the origin where the table is no sweep of a log with one.
+      (3,) float64, m: by the log's calibration, or the origin where there is none.
 
     Raises:
       InputError: where there is a calibration that cannot be read.
@@ -157,7 +157,7 @@ def read_table(path: str | os.PathLike[str], columns: tuple[str, ...]) -> dict[s
       The columns that are there.
 
     Raises:
-      InputError: where it is no such table.
+      InputError: where it is not such a table.
       ImportError: without the extra ``arrow``.
     """
     arrow = require("pyarrow", extra="arrow", what="Feather files")

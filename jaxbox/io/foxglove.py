@@ -40,7 +40,7 @@ _HIDDEN_ALPHA = 0.12
 _LINE_PX = 2.0
 _ARROW_M = 0.15
 _ARROW_S = 1.0
-"""An arrow is as long as the way of so long a time."""
+"""An arrow is as long as the distance covered in this time."""
 _TEXT_SIZE_M = 0.6
 _TEXT_GAP_M = 0.5
 _NS_PER_S = 10**9

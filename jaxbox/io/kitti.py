@@ -36,7 +36,7 @@ VEHICLE_TYPES = tuple(label.word.capitalize() for label in Label)
 MIN_VISIBLE_FRACTION = 0.3
 """Boxes with less of their 2D box in the image are not answers: the labels hold what the image shows."""
 
-# Boxes go to the image so many at a time, the last ones padded, so that one number of them is compiled.
+# Boxes are projected in chunks of this size, the last one padded, so that one shape is compiled.
 _CHUNK = 256
 
 _project_boxes = jax.jit(project_boxes)

@@ -100,7 +100,7 @@ def _about(axis: int, angle: np.ndarray) -> np.ndarray:
 
 
 def oxts_poses(sweeps: Sequence[Sweep]) -> tuple[np.ndarray, str] | None:
-    """Poses of sweeps of a tracking sequence or a raw drive, by the navigation that lies beside them.
+    """Poses of sweeps of a tracking sequence or a raw drive, by the navigation data next to them.
 
     Args:
       sweeps: of one sequence, at least one.
@@ -127,7 +127,7 @@ def _tracking_poses(sweeps: Sequence[Sweep], root: pathlib.Path) -> tuple[np.nda
     if not path.is_file():
         return None
     if sweeps[0].calibration_path is None:
-        raise UnusableSource(f"{path}: no calibration beside it says where the IMU is")
+        raise UnusableSource(f"{path}: no calibration next to it says where the IMU is")
     T_velo_imu = read_transform(sweeps[0].calibration_path, "Tr_imu_to_velo", "Tr_imu_velo")
     T_world_imu = read_oxts(path)
     frames = np.array([sweep.frame or 0 for sweep in sweeps])
@@ -157,8 +157,8 @@ def odometry_pose_file(sweep: Sweep) -> pathlib.Path | None:
       sweep: ``sequences/00/velodyne/000000.bin``.
 
     Returns:
-      ``poses/00.txt`` beside ``sequences``, or the sequence's own ``poses.txt``; None where there is neither,
-      or the layout is another one.
+      ``poses/00.txt`` next to ``sequences``, or the sequence's own ``poses.txt``; None where there is
+      neither, or the layout is another one.
     """
     sequence = sweep.points_path.parent.parent
     if sweep.points_path.parent.name != "velodyne" or sequence.parent.name != "sequences":

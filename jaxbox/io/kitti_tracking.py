@@ -137,7 +137,7 @@ def read_track_detections(path: str | os.PathLike[str]) -> list[KittiObject]:
       One object a line, in the file's order, with a frame and a score, and no identity.
 
     Raises:
-      InputError: naming file and line, for a wrong number of columns, a field that is no finite number,
+      InputError: naming file and line, for a wrong number of columns, a field that is not a finite number,
         or an unknown type.
     """
     lines = enumerate(read_text(path).splitlines(), start=1)

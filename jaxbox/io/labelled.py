@@ -100,6 +100,7 @@ def finite_number(value: object, name: str, where: str) -> float:
       InputError: where it is missing, no number or not finite.
     """
     try:
+        # Other types are a TypeError.
         number = float(value)  # pyright: ignore[reportArgumentType]
     # A whole number of hundreds of digits overflows.
     except (TypeError, ValueError, OverflowError):

@@ -64,7 +64,7 @@ def read_las(path: str | os.PathLike[str]) -> Points:
             else:
                 _check_layers(pathlib.Path(path), header, size)
             points = reader.read()
-        # A scale that is not a number makes points that are none, which the detector counts.
+        # A scale that is not a number makes points that are not finite, which the detector counts.
         with np.errstate(all="ignore"):
             columns = {name: np.asarray(getattr(points, name)) for name in ("x", "y", "z", "intensity")}
     except InputError:

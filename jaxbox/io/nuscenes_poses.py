@@ -119,7 +119,7 @@ def iter_json_records(path: pathlib.Path) -> Iterator[dict[str, Any]]:
       The objects.
 
     Raises:
-      InputError: where it is no such list, or an object takes a megabyte.
+      InputError: where it is not such a list, or an object takes a megabyte.
     """
     check_file(path, max_bytes=None)
     decoder, text, start = json.JSONDecoder(), "", 0
@@ -147,7 +147,7 @@ def iter_json_records(path: pathlib.Path) -> Iterator[dict[str, Any]]:
 
 
 def _skip(text: str, start: int) -> int:
-    """The next place that is no blank, comma or opening bracket."""
+    """The next place that is not a blank, comma or opening bracket."""
     while start < len(text) and text[start] in " \t\r\n,[":
         start += 1
     return start

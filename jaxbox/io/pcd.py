@@ -1,7 +1,7 @@
 """PCD, the Point Cloud Library's format: ascii, binary and binary_compressed, by way of pypcd4.
 
-What a header claims is held against the file before any memory is asked for. The text body is read here:
-pypcd4 takes exactly one blank between numbers, and real files have more.
+What a header claims is checked against the size of the file before memory is allocated. The text body is read
+here: pypcd4 takes exactly one blank between numbers, and real files have more.
 """
 
 import io

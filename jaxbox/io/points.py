@@ -136,6 +136,7 @@ def record_dtype(layout: Mapping[str, Any], where: str) -> np.dtype:
       InputError: where NumPy knows no such type, as of points of gigabytes.
     """
     try:
+        # NumPy checks the names and types of the layout itself.
         return np.dtype(dict(layout))  # pyright: ignore[reportArgumentType, reportCallIssue]
     except (ValueError, TypeError) as error:
         raise InputError(f"{where}: the layout of a point makes no sense ({reason(error)}).") from error

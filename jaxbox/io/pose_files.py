@@ -66,7 +66,7 @@ def read_pose_file(path: str | os.PathLike[str]) -> PoseFile:
 
     Raises:
       InputError: naming file and line, for another number of columns, a number that is not finite, or a pose
-        that is no rigid transform; and for a file without poses.
+        that is not a rigid transform; and for a file without poses.
     """
     rows, lines, columns = [], [], 0
     for number, line in enumerate(read_text(path).splitlines(), start=1):
@@ -105,7 +105,7 @@ def rigid_or_error(T: np.ndarray, where: Callable[[int], str]) -> np.ndarray:
       (n, 4, 4) float64.
 
     Raises:
-      InputError: for the first that is no rigid transform, or is farther away than any place on earth.
+      InputError: for the first that is not a rigid transform, or is farther away than any place on earth.
     """
     for index in np.flatnonzero(~_are_near_rigid(T)):
         problem = check_pose(T[index]) or f"its position is {np.abs(T[index, :3, 3]).max():.3g} m away"
@@ -114,7 +114,7 @@ def rigid_or_error(T: np.ndarray, where: Callable[[int], str]) -> np.ndarray:
 
 
 def _are_near_rigid(T: np.ndarray) -> np.ndarray:
-    """Which poses `check_pose` accepts and are on earth: all at once, as there may be a hundred a second."""
+    """Which poses `check_pose` accepts and are on earth: in one go, as there may be a hundred a second."""
     R = T[:, :3, :3]
     # Numbers that are not finite, or whose squares are not, fail every comparison.
     with np.errstate(over="ignore", invalid="ignore"):

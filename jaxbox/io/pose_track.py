@@ -8,7 +8,7 @@ import numpy as np
 from jaxbox.geometry.rigid import interpolate_rigid
 
 MAX_EXTRAPOLATION_S = 0.1
-"""A sweep may lie so far outside of the poses' times: as long as one sweep at 10 Hz."""
+"""A sweep may lie this far outside of the poses' times: one period at 10 Hz."""
 MAX_GAP_S = 1.0
 """Poses farther apart say too little of the motion between them."""
 _NS_PER_S = 10**9

@@ -19,7 +19,7 @@ from jaxbox.io.pose_track import PoseTrack, UnusableSource
 from jaxbox.io.recorded_poses import collect_poses, odometry_poses, tf_poses
 from jaxbox.io.sweep import Sweep
 from jaxbox.io.sweeps import recording_format
-from jaxbox.run.carrier import ESTIMATED
+from jaxbox.run.pose_providers import ESTIMATED
 from jaxbox.tracking.poses import Poses, PoseSource, orthonormal_pose
 
 AUTO = "auto"
@@ -35,7 +35,7 @@ def choose_poses(
 
     Args:
       sweeps: as `find_poses` takes them.
-      asked: `AUTO`, a word of `jaxbox.run.carrier.ESTIMATED`, or a file or folder.
+      asked: `AUTO`, a word of `jaxbox.run.pose_providers.ESTIMATED`, or a file or folder.
       report: as `find_poses` takes it.
       warn: is told why poses of the data set or recording cannot be used.
 
@@ -95,7 +95,7 @@ def find_poses(
 ) -> Poses | None:
     """Finds the poses of the sweeps of one sequence.
 
-    In this order: the file that is named; KITTI's oxts, beside tracking sequences and raw drives; ``poses``
+    In this order: the file that is named; KITTI's oxts, next to tracking sequences and raw drives; ``poses``
     of KITTI's odometry benchmark; of a recording ``nav_msgs/Odometry``, then ``/tf``; nuScenes' tables;
     Argoverse 2's ``city_SE3_egovehicle.feather``. Between poses of other times than the sweeps' it is
     interpolated, up to 0.1 s beyond their ends. A recording is passed twice, and its points are not decoded.
@@ -114,7 +114,7 @@ def find_poses(
       The poses, at the points' own frame: level where the sweeps are. None where there are none.
 
     Raises:
-      InputError: naming file and line, or recording and topic, for what is no pose, and where the file that
+      InputError: naming file and line, or recording and topic, for an invalid pose, and where the file that
         is named does not fit the sweeps.
       ImportError: naming the extra that a source needs, where that is not installed.
       ValueError: for sweeps of several sequences.

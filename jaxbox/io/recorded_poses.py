@@ -50,7 +50,7 @@ class _Samples:
         self.rows.append((*turn, place.x, place.y, place.z))
 
     def check(self, path: pathlib.Path) -> None:
-        """Makes poses of the numbers, all at once: there may be a hundred a second."""
+        """Makes poses of the numbers, in one go: there may be a hundred a second."""
         rows = np.array(self.rows, np.float64).reshape(-1, 7)
         self.poses = rigid_from_quaternions(
             rows[:, :4], rows[:, 4:], lambda index: f"{path}, {self.topic} at {self.recorded_ns[index]}"
@@ -92,7 +92,7 @@ def collect_poses(messages: Iterable[PoseMessage], path: pathlib.Path) -> Record
       What they say.
 
     Raises:
-      InputError: naming recording, topic and time, for a pose that is none.
+      InputError: naming recording, topic and time, for an invalid pose.
     """
     found = RecordedPoses(path)
     for topic, recorded, message in messages:

@@ -146,7 +146,7 @@ def recording_format(path: pathlib.Path) -> RecordingFormat | None:
       path: of either.
 
     Returns:
-      The format, or None where it is no recording.
+      The format, or None where it is not a recording.
     """
     if path.name.startswith("."):
         return None

@@ -19,7 +19,7 @@ from jaxbox.reference.state import (
 from jaxbox.types import Label
 
 CERTAIN = np.inf
-"""Objective of a box that was not held against evidence: it passes every gate."""
+"""Objective of a box without evidence: it passes every gate."""
 INSIDE_MARGIN_M = 0.1
 """A fitted point this far outside a hypothesis still counts as inside."""
 FACE_OVERHANG_M = 0.3

@@ -7,7 +7,7 @@ from jaxbox.config import FilterConfig, RegionConfig
 from jaxbox.reference.state import Sweep
 
 MAX_ABS_Z_M = 100.0
-"""No road or vehicle in range of the sensor is so far above or below it."""
+"""No road or vehicle in range is this far above or below the sensor."""
 
 
 def select_points(xyz: np.ndarray, config: FilterConfig, region: RegionConfig) -> Sweep:

@@ -13,7 +13,7 @@ HEIGHT_RANGE_M = 1.2, 2.0
 PROFILE_SD, MAX_PART_COST = 0.15, 4.0
 """Standard deviation of a top, as a share of the height, and the most that one part counts."""
 LOG_ODDS_PER_COST = 0.3
-"""What a cost is worth, as tops of neighbouring parts are not independent."""
+"""Log odds of a unit of cost, as tops of neighbouring parts are not independent."""
 
 
 def find_fronts(

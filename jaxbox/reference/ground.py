@@ -27,7 +27,7 @@ SUPPORT_SQUARE_M = 2.0
 SUPPORT_LEVELS_PER_M = 10.0
 """Heights are compared in levels of .1 m."""
 SUPPORT_LEVELS = 12
-"""Two levels are held against so many from the lower of them up."""
+"""Two levels are compared with this many from the lower of them up."""
 SENSOR_LEVELS, PLANE_LEVELS = range(-100, 28), range(-13, 11)
 """Levels about the sensor, and about the plane."""
 MIN_PLANE_POINTS = 3
@@ -139,7 +139,7 @@ def least_supported(
     count = ndimage.convolve(count, np.ones((3, 3, 1)), mode="constant")
 
     def up_to(num: int) -> np.ndarray:
-        """In each level and the ones above it, so many in all."""
+        """Sums over each level and the ones above it, this many in all."""
         padded = np.pad(count, ((0, 0), (0, 0), (0, num - 1)))
         return np.lib.stride_tricks.sliding_window_view(padded, num, axis=2).sum(axis=-1)
 

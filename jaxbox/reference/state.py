@@ -149,7 +149,7 @@ class CompletedBox:
     box: np.ndarray
     """(5,): x, y, length, width in m and yaw in rad, not wrapped."""
     objective: float
-    """J, how well the box explains the evidence; infinite where it was not held against any."""
+    """J, how well the box explains the evidence; infinite where there is none."""
     measured_length_m: float
     """Extent of the fitted points along the box."""
     measured_width_m: float

@@ -26,7 +26,7 @@ from jaxbox.reference.tracks import (
 RIGID_TOLERANCE = 1e-3
 """Entries of R R^T may differ from those of the identity by this."""
 MAX_TURN_DEG_PER_S = 180.0
-"""No carrier turns faster."""
+"""No vehicle turns faster."""
 FIRST_INTERVAL_S = 0.1
 """What is taken for the time before the first sweep."""
 Z_GAIN, FIRST_Z_GAIN = 0.3, 0.5
@@ -138,7 +138,7 @@ def _is_rotation(matrix: np.ndarray) -> bool:
 def _jumps(rotation: np.ndarray, translation: np.ndarray, dt: float, config: TrackConfig) -> bool:
     # Of the eigenvalues 1, exp(i a) and exp(-i a) of a rotation by a.
     angle = np.abs(np.angle(np.linalg.eigvals(rotation))).max()
-    too_far = np.linalg.norm(translation) > float(config.max_carrier_speed_mps) * dt
+    too_far = np.linalg.norm(translation) > float(config.max_ego_speed_mps) * dt
     return bool(too_far or np.degrees(angle) > MAX_TURN_DEG_PER_S * dt)
 
 

@@ -13,15 +13,16 @@ MOMENT_S = 0.1
 AGE_TOLERANCE = 0.25
 """A moment stands for another whose age differs by less than this share."""
 MEMORY_S = 1.0
-"""Speed and course are compared with those so long ago."""
+"""Speed and course are compared with those this long ago, s."""
 LANE_S, LANE_END_S, LANE_END_M = 5.0, 0.8, 2.0
-"""A change of lanes is looked for in so long a path, whose ends are so long, and at least this far."""
+"""A lane change is looked for in a path of this duration, s, whose ends have this duration, s, and at least
+this length, m."""
 MATURE_HITS = 10
 """Detections after which a velocity is good enough to be compared with an earlier one."""
 FIRST_MOMENTS = 3
 """The velocity at a path's first moments is compared with none."""
 SPEED_SDS = 3.0
-"""A vehicle that moves is faster than so many standard deviations of its speed."""
+"""A vehicle that moves is faster than this many standard deviations of its speed."""
 STARTING_SPEED_MPS, STOPPING_SPEED_MPS, TURNING_SPEED_MPS = 3.0, 4.0, 1.5
 """A vehicle starts from below the first, stops below the second, and turns above the third."""
 
@@ -57,7 +58,7 @@ def remember(tracker: Tracker) -> None:
 
 
 def find_moment(tracker: Tracker, ago_s: float) -> tuple[int, float]:
-    """Place and age of the moment that was nearest to so long ago.
+    """Place and age of the moment nearest to a time ago.
 
     Args:
       tracker: after the sweep.
@@ -132,7 +133,7 @@ def angle_between(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def lateral_shift(track: Track, tracker: Tracker, config: TrackConfig) -> float:
-    """Shift to the left between two courses that agree, m; 0 where it is no change of lanes.
+    """Shift to the left between two courses that agree, m; 0 where lanes are not changed.
 
     Args:
       track: after the sweep.

@@ -10,7 +10,7 @@ from jaxbox.config import TrackConfig
 from jaxbox.reference.tracks import MATURE_HITS, Track
 
 MAX_YAW_POINTS, MAX_SIZE_POINTS = 300, 500
-"""More points make a detection's yaw, and its size, no surer."""
+"""More points add nothing to the weight of a detection's yaw, and of its size."""
 CROSSED_WEIGHT = 1e-3
 """Weight of the size of a detection whose length lies across the track's, and of one without points."""
 SEEN_QUANTILE, SEEN_STEP_M, SEEN_MIN_STEP_M = 0.9, 0.5, 0.05

@@ -16,7 +16,7 @@ from jaxbox.types import PointCloud
 _COLUMNS = 3
 """x, y, z; a fourth is the intensity."""
 _MAX_COLUMNS = 16
-"""An array of more columns has a row for x, one for y and one for z instead: no source has so many fields."""
+"""An array of more columns has a row for x, one for y and one for z instead: no source has as many fields."""
 
 
 def as_config(config: DetectorConfig | str | None) -> DetectorConfig:
@@ -30,7 +30,7 @@ def as_config(config: DetectorConfig | str | None) -> DetectorConfig:
 
     Raises:
       ValueError: for a name that no preset has.
-      TypeError: for what is no configuration.
+      TypeError: for anything else.
 
     >>> as_config("paper") == DetectorConfig.paper()
     True
@@ -40,7 +40,7 @@ def as_config(config: DetectorConfig | str | None) -> DetectorConfig:
     if isinstance(config, str):
         presets = DetectorConfig.presets()
         if config not in presets:
-            raise ValueError(f"{config!r} is no preset; there are {', '.join(presets)}.")
+            raise ValueError(f"{config!r} is not a preset; choose one of {', '.join(presets)}.")
         return presets[config]
     if not isinstance(config, DetectorConfig):
         raise TypeError(
@@ -60,7 +60,7 @@ def as_key(key: Any) -> Any:
       The key.
 
     Raises:
-      TypeError: for what is neither.
+      TypeError: for anything else.
     """
     if key is None:
         return _key_of(0)
@@ -90,7 +90,7 @@ def as_points(points: Any, *, called: str) -> tuple[np.ndarray, np.ndarray | Non
       xyz (n, 3), and intensity (n,) or None.
 
     Raises:
-      TypeError: for what is no array, or is being traced.
+      TypeError: for anything but an array, and for one that is being traced.
       ValueError: for another shape.
     """
     if isinstance(points, jax.core.Tracer):
@@ -109,12 +109,12 @@ def as_points(points: Any, *, called: str) -> tuple[np.ndarray, np.ndarray | Non
         kind = f"{type(points).__qualname__} of {type(points).__module__}"
         raise TypeError(f"{called} takes an array (n, 3) of real numbers or a PointCloud; this is {kind}.")
     if array.ndim != 2 or not _COLUMNS <= array.shape[1] <= _MAX_COLUMNS:
-        mend = _mend(array)
-        raise ValueError(f"the points have shape {array.shape}; it must be (n, 3) or more columns{mend}.")
+        fix = _fix_of(array)
+        raise ValueError(f"the points have shape {array.shape}; it must be (n, 3) or more columns{fix}.")
     return array[:, :_COLUMNS], array[:, _COLUMNS] if array.shape[1] > _COLUMNS else None
 
 
-def _mend(array: np.ndarray) -> str:
+def _fix_of(array: np.ndarray) -> str:
     """What to do about a wrong shape."""
     if array.ndim == 3:
         return ": one sweep at a time, or jaxbox.detect_batch(sweeps), jaxbox.stream(sweeps)"

@@ -52,7 +52,7 @@ def detect(
     Raises:
       ValueError: for fields that contradict each other, a name that no preset has, or arrays of other shapes
         than `PointCloud` says.
-      TypeError: for what is no cloud, no array, no configuration or no key.
+      TypeError: for anything but a cloud or array, a configuration or preset, and a key or seed.
 
     Status bits: all of `Status`; `Detections.raise_if_failed` turns those of full capacities into an error.
 
@@ -114,6 +114,7 @@ def lower(
     Returns:
       What `jax.jit(...).lower` gives.
     """
+    # To pyright what `jax.jit` returns is a function without these methods.
     if platform is None:
         return _detect_jit.trace(*_operands(cloud, config, key)).lower()  # pyright: ignore[reportFunctionMemberAccess, reportAttributeAccessIssue]
     with building_for(accelerator=platform != "cpu"):

@@ -26,7 +26,7 @@ THREADS_VARIABLE = "NPROC"
 """Environment variable by which XLA is told how many threads a process may take."""
 
 _END_S = 10.0
-"""An idle process that has not ended by itself after so long is killed."""
+"""An idle process that has not ended by itself after this time is killed."""
 
 _LARGE_BYTES = 4096
 """Arrays of this size and more go from process to process as they are; smaller ones within the pickle."""
@@ -88,7 +88,7 @@ class ProcessPool(Generic[Item, Result]):
             are items and results; a script must start its work under ``if __name__ == "__main__":``.
           workers: number of processes. They share the cores.
         """
-        self._start, self._surroundings = start, _Surroundings.of_this(workers)
+        self._start, self._surroundings = start, _Environment.of_this(workers)
         self._threads = concurrent.futures.ThreadPoolExecutor(workers, initializer=_keep_interrupts_away)
         self._own = threading.local()
         self._lock, self._left = threading.Lock(), False
@@ -164,14 +164,14 @@ def _keep_interrupts_away() -> None:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Surroundings:
+class _Environment:
     """What a process must know before JAX starts in it."""
 
     num_threads: int
     cache_folders: CacheFolders
 
     @classmethod
-    def of_this(cls, workers: int) -> "_Surroundings":
+    def of_this(cls, workers: int) -> "_Environment":
         return cls(
             num_threads=max(1, (os.cpu_count() or 1) // workers),
             cache_folders=CacheFolders.of_this_process(),
@@ -185,7 +185,7 @@ class _Surroundings:
 class _Process:
     """A worker process as its thread in the parent sees it."""
 
-    def __init__(self, start: _Start, surroundings: _Surroundings) -> None:
+    def __init__(self, start: _Start, surroundings: _Environment) -> None:
         # A fork would copy JAX's threads half-way through their work.
         context = multiprocessing.get_context("spawn")
         self._connection, theirs = context.Pipe()
@@ -236,7 +236,7 @@ def _describe_exit(code: int | None) -> str:
     return f"killed by {signal.Signals(-code).name}{hint}"
 
 
-def _serve(connection: Connection, surroundings: _Surroundings, start: _Start) -> None:
+def _serve(connection: Connection, surroundings: _Environment, start: _Start) -> None:
     """A worker process: answers items until the parent lets go."""
     surroundings.apply()
     calls: list[Callable[[Any], Any]] = []

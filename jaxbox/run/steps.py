@@ -27,7 +27,7 @@ from jaxbox.xla.barriers import outline
 from jaxbox.xla.ragged import PointLists
 
 _MIN_CLUSTERS = 64
-"""Boxes are fitted to so many clusters, or twice as many, and so on: one compile each."""
+"""Boxes are fitted to this many clusters, twice as many, and so on: one compile each."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,7 +80,7 @@ def remove_ground(
       What each point is; ``is_ground`` is `Detections.ground_mask`.
 
     Raises:
-      TypeError: for what is no array.
+      TypeError: for anything but an array.
       ValueError: for another shape, or more points than the largest usual capacity.
 
     Reference: paper, 3.1 and Algorithm I; oracle `jaxbox.reference.ground`.
@@ -104,7 +104,7 @@ def cluster_points(
     """Clusters the points of a sweep that stand above its ground: connected components of fine cells.
 
     Args:
-      xyz: (n, 3 or more) m, sensor frame, with the ground, which is found and left out first.
+      xyz: (n, 3 or more) m, sensor frame, with the ground, which is removed first.
       config: as `jaxbox.detect` takes it: its region, filtering, ground and first map count.
       key: as `jaxbox.detect` takes it.
 
@@ -112,7 +112,7 @@ def cluster_points(
       (n,) int32: number of each point's cluster, -1 for none; it is `Detections.point_component`.
 
     Raises:
-      TypeError: for what is no array.
+      TypeError: for anything but an array.
       ValueError: for another shape, or more points than the largest usual capacity.
       RuntimeError: where a capacity of the configuration is too small, naming it.
 
@@ -150,7 +150,7 @@ def fit_boxes(
       A box for each cluster that has points.
 
     Raises:
-      TypeError: for what is no array.
+      TypeError: for anything but an array.
       ValueError: for another shape, clusters of another number of points, or points that are not finite.
       RuntimeError: as `cluster_points`.
 
@@ -235,6 +235,7 @@ def _best_angles(xy: np.ndarray, start: np.ndarray, total: np.ndarray, config: D
     num_entries = max(fitting_capacity(len(xy)), len(xy))
     x, y = (padded(column, num_entries, np.float32) for column in xy.T)
     begin, count = (padded(values, capacity, np.int32) for values in (start, total))
+    # NumPy's arrays, which a compiled function takes as well.
     lists = PointLists(x, y, begin, count, config.box.max_points)  # pyright: ignore[reportArgumentType]
     packed = PackedConfig.pack(config, accelerator=on_accelerator())
     return np.asarray(_find_angles(lists, np.int32(num_clusters), packed), np.float64)[:num_clusters]

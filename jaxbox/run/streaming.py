@@ -95,7 +95,7 @@ def stream(
     Raises:
       ValueError: for settings that contradict each other, workers below 1, no devices, or devices together
         with several workers; when its turn comes, for an array of another shape.
-      TypeError: for one sweep or a path instead of sweeps; when its turn comes, for what is no sweep.
+      TypeError: for one sweep or a path instead of sweeps; when its turn comes, for anything but a sweep.
     """
     if track is not None:
         from jaxbox.run import tracking  # noqa: PLC0415 - it is built on this module
@@ -112,7 +112,7 @@ def stream(
         return _stream_here(readable, config, one_key, capacity, checked_devices(devices))
     if devices is not None:
         raise ValueError(f"workers is {workers} and devices are named; name one of the two.")
-    return _stream_apart(readable, _Settings.pack(config, one_key, capacity), workers)
+    return _stream_in_processes(readable, _Settings.pack(config, one_key, capacity), workers)
 
 
 class _Buffer:
@@ -205,7 +205,7 @@ class _Settings:
         )
 
 
-def _stream_apart(
+def _stream_in_processes(
     sweeps: Iterable[ReadableSweep], settings: _Settings, workers: int
 ) -> Iterator[StreamedSweep]:
     with ProcessPool(settings.start, workers) as pool:

@@ -44,21 +44,21 @@ class CapacityUse:
 
 @dataclasses.dataclass(frozen=True)
 class Spread:
-    """Least, median and greatest of some values; None of each where there is none."""
+    """Minimum, median and maximum of some values; None of each where there is none."""
 
-    least: float | None
+    minimum: float | None
     """In the values' unit, as the next two."""
     median: float | None
     """The middle one, or the mean of the middle two."""
-    greatest: float | None
-    """The last in order."""
+    maximum: float | None
+    """In the same unit."""
 
     @classmethod
     def of(cls, values: np.ndarray) -> "Spread":
         """The spread of (n,) numbers.
 
         >>> Spread.of(np.array([3.0, 1.0]))
-        Spread(least=1.0, median=2.0, greatest=3.0)
+        Spread(minimum=1.0, median=2.0, maximum=3.0)
         """
         if len(values) == 0:
             return cls(None, None, None)

@@ -14,7 +14,7 @@ from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.config.checks import check_ranges
 from jaxbox.geometry.rigid import relative_rigid
 from jaxbox.run.arguments import as_sweeps
-from jaxbox.run.carrier import Carrier, Clock, make_carrier, prepared, without_points
+from jaxbox.run.pose_providers import Clock, PoseProvider, make_pose_provider, prepared, without_points
 from jaxbox.run.streaming import ReadableSweep, StreamedSweep, stream
 from jaxbox.tracking.poses import Poses, PoseSource, check_pose, orthonormal_pose
 from jaxbox.tracking.smoothing import smooth
@@ -102,23 +102,23 @@ def track(
       ValueError: as `stream`; for poses of another number or shape, a rate that is not positive, or no slots.
       ImportError: for "kiss-icp" without the extra ``track``.
     """
-    carrier = make_carrier(poses)
+    provider = make_pose_provider(poses)
     clock = Clock(rate_hz, poses.times_ns if isinstance(poses, Poses) else None)
     track_config = TrackConfig() if track_config is None else track_config
     check_ranges(track_config)
     readable = as_sweeps(sweeps, called="jaxbox.track")
-    tracker = _Tracker(track_config, carrier.source, max_tracks)
+    tracker = _Tracker(track_config, provider.source, max_tracks)
     begun: collections.deque[ReadableSweep] = collections.deque()
     streamed = stream(
-        prepared(readable, carrier, begun), config, key, capacity=capacity, workers=workers, devices=devices
+        prepared(readable, provider, begun), config, key, capacity=capacity, workers=workers, devices=devices
     )
-    return _track(streamed, begun, carrier, clock, tracker)
+    return _track(streamed, begun, provider, clock, tracker)
 
 
 def _track(
     streamed: Any,
     begun: collections.deque[ReadableSweep],
-    carrier: Carrier,
+    provider: PoseProvider,
     clock: Clock,
     tracker: "_Tracker",
 ) -> Generator[TrackedSweep, None, None]:
@@ -129,7 +129,7 @@ def _track(
             time_ns = clock.read(index, sweep)
             tracks = T_world_sensor = None
             if found.detections is not None:
-                given = carrier.locate(index, found.detections)
+                given = provider.locate(index, found.detections)
                 tracks, T_world_sensor = tracker.step(found.detections, time_ns, given)
             yield TrackedSweep(
                 **vars(found),
@@ -137,7 +137,7 @@ def _track(
                 time_ns=time_ns,
                 tracks=tracks,
                 T_world_sensor=T_world_sensor,
-                pose_source=carrier.source,
+                pose_source=provider.source,
             )
 
 
@@ -191,7 +191,7 @@ def _step(
 
 
 class _Tracker:
-    """The tracker's memory, and the last sweep and pose that it believed."""
+    """The tracker's memory, and the last sweep and pose that it accepted."""
 
     def __init__(self, config: TrackConfig, source: PoseSource, max_tracks: int) -> None:
         self._config = jax.tree.map(float, config)
@@ -203,7 +203,7 @@ class _Tracker:
     def step(
         self, detections: Detections, time_ns: int, T_world_sensor: np.ndarray
     ) -> tuple[Tracks, np.ndarray]:
-        """The tracks of a sweep on the host, and its pose as far as it could be believed."""
+        """The tracks of a sweep on the host, and its pose where that is valid."""
         is_pose = check_pose(T_world_sensor) is None
         T_now = orthonormal_pose(T_world_sensor) if is_pose else None
         motion = self._motion_to(T_now)
@@ -212,11 +212,11 @@ class _Tracker:
         )
         tracks = tracks.on_host()
         status = TrackStatus(int(tracks.status)) | self._bits
-        # The first sweep's pose is no motion yet, so the step has not judged it.
+        # The first sweep has no motion yet, so the step has not checked its pose.
         status |= TrackStatus.OK if is_pose else TrackStatus.POSE_INVALID
         if TrackStatus.TIME_NOT_LATER not in status:
             self._last_ns = time_ns
-            # After a pose that was none, the next one tells the way since the last good one.
+            # After an invalid pose, the next one gives the motion since the last valid one.
             self._T_world_last = self._T_world_last if T_now is None else T_now
         T_believed = np.eye(4) if self._T_world_last is None else self._T_world_last
         return dataclasses.replace(tracks, status=np.asarray(int(status), np.int32)), T_believed

@@ -51,7 +51,7 @@ NEAR_M = 0.1
 
 
 FACE_OVERHANG_M = 0.3
-"""Faces reach this far beyond their corners when points are held against them."""
+"""Faces reach this far beyond their corners when points are compared with them."""
 
 
 FAR_M = 1e9
@@ -141,7 +141,7 @@ def list_hypotheses(
 
 
 def _may_fit(prior: ClassPrior, candidates: Sequence[Rectangles], config: VehicleConfig) -> jax.Array:
-    """(P,) whether some rectangle of a cluster is no larger than a class, and not too small to tell."""
+    """(P,) whether some rectangle of a cluster fits into a class, and is large enough to be judged."""
     fits = jnp.zeros_like(candidates[0].angle, bool)
     for rectangles in candidates:
         long, short = longest_side(rectangles), jnp.min(rectangles.high - rectangles.low, axis=1)

@@ -22,11 +22,12 @@ PROFILE_SD = 0.15
 MAX_PART_COST = 4.0
 """A part counts no more than a top that is two standard deviations off: roof racks, occluded parts."""
 LOG_ODDS_PER_COST = 0.3
-"""Tops of neighbouring parts are not independent: a cost is worth less than the half of normal errors."""
+"""Tops of neighbouring parts are not independent: a unit of cost counts less than the 1/2 of independent
+normal errors."""
 
 
 def find_fronts(owners: Owners, obstacles: Obstacles, kept: Kept) -> tuple[jax.Array, jax.Array]:
-    """Where the front of each detection points, and how sure that is.
+    """Finds where the front of each detection points, and with what probability.
 
     Args:
       owners: the points of K detections.
@@ -47,7 +48,7 @@ def find_fronts(owners: Owners, obstacles: Obstacles, kept: Kept) -> tuple[jax.A
 
 
 def profile_tops(owners: Owners, obstacles: Obstacles, kept: Kept) -> jax.Array:
-    """The highest point in each part of a box, from the end opposite to its yaw on.
+    """Finds the highest point in each part of a box, from the end opposite to its yaw on.
 
     Args:
       owners: the points of K detections.
@@ -71,7 +72,7 @@ def profile_tops(owners: Owners, obstacles: Obstacles, kept: Kept) -> jax.Array:
         return owner * NUM_PARTS + part, take(obstacles.height, row)
 
     part, height = map_rows(place, (owners.row, owners.owner), num_rows=owners.num)
-    # The points of no detection are in a row of their own, which is left out.
+    # The points of no detection are in a row of their own, which is dropped.
     part = jnp.minimum(part, num * NUM_PARTS)
     table = reduce_segments(
         lambda height: ([height], [jnp.ones_like(height)]),
@@ -85,7 +86,7 @@ def profile_tops(owners: Owners, obstacles: Obstacles, kept: Kept) -> jax.Array:
 
 
 def front_log_odds(tops: jax.Array, profile: jax.Array) -> jax.Array:
-    """How much rather the front is where the box's yaw points than opposite.
+    """Log odds that the front is where the box's yaw points, and not opposite.
 
     Args:
       tops: (K, parts) float32, shares of the height; minus infinity where unknown.

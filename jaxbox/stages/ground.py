@@ -227,7 +227,7 @@ def least_supported(
 
 
 def _from_level(count: jax.Array, level: int) -> jax.Array:
-    """The counts of so many levels higher; none beyond the last."""
+    """The counts of the levels that are higher by this many; 0 beyond the last."""
     return jnp.pad(count[level:], ((0, level), (0, 0), (0, 0)))
 
 
@@ -365,7 +365,7 @@ def fit_ground_surface(xyz: jax.Array, mask: jax.Array, planes: jax.Array, confi
     Args:
       xyz: (N, 3) float32, m.
       mask: (N,) bool, points that count.
-      planes: (rounds, 3) float32; with several, a point is held against the one under it.
+      planes: (rounds, 3) float32; with several, a point is compared with the one under it.
       config: the grid, the band round a plane, the slope limit and the Gaussian.
 
     Returns:

@@ -16,7 +16,7 @@ from jaxbox.xla.rows import compact, lookup_each, take
 from jaxbox.xla.segments import argmax_key, argmax_row
 
 MIN_EXTENT_M = 1e-6
-"""Clusters narrower than this are cut as if they were so wide: all their points are in one slice."""
+"""Clusters narrower than this are cut as if they had this width: all their points are in one slice."""
 
 
 def outline_clusters(obstacles: Obstacles, clusters: Clusters, config: DetectorConfig) -> Outlines:

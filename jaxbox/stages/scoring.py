@@ -429,7 +429,7 @@ def neighbourhood_score(
 ) -> jax.Array:
     """The part of the score that the points in and round the box decide.
 
-    The true top lies between the top of the points and that plus the beams' spacing; it is held against the
+    The true top lies between the top of the points and that plus the beams' spacing; it is compared with the
     class at the place in between that suits it best.
 
     Args:

@@ -212,7 +212,7 @@ class FlatBoxes(Protocol):
 
     @property
     def yaw(self) -> jax.Array:
-        """From +x about +z, rad, any turn."""
+        """From +x about +z, rad, not wrapped."""
         ...
 
 
@@ -244,7 +244,7 @@ class Boxes:
     width: jax.Array
     """(...) float32, m."""
     yaw: jax.Array
-    """(...) float32, rad, any turn."""
+    """(...) float32, rad, not wrapped."""
     measured: jax.Array
     """(..., 2) float32, m: length and width before completion."""
     objective: jax.Array

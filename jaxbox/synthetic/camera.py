@@ -15,9 +15,9 @@ PRINCIPAL_POINT_PX = (610.0, 173.0)
 CAMERA_XYZ_M = (0.27, 0.0, -0.08)
 """Of the rectified frame's origin, in the sensor frame."""
 BASELINE_M = 0.06
-"""The colour camera stands so far left of that origin, so P's last column is not zero, as in KITTI."""
+"""The colour camera stands this far left of that origin, so P's last column is not zero, as in KITTI."""
 CAMERA_PITCH_DEG = 0.8
-"""The camera looks so far down."""
+"""The camera looks down by this angle."""
 
 SUN = np.array([-0.45, 0.5, 0.75]) / np.linalg.norm([-0.45, 0.5, 0.75])
 """Direction toward the sun: behind and to the left."""

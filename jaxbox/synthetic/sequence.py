@@ -50,7 +50,7 @@ class TruthTracks:
     label: np.ndarray
     """(K,) int64: a `jaxbox.Label`."""
     velocity: np.ndarray
-    """(K, 2) float64, m/s: over ground, not relative to the carrier, along the sensor's x and y axes."""
+    """(K, 2) float64, m/s: over ground, not relative to the ego vehicle, along the sensor's x and y axes."""
     acceleration: np.ndarray
     """(K,) float64, m/s^2: of the speed along the lane."""
     turn_rate: np.ndarray
@@ -174,13 +174,13 @@ class SyntheticSequence(collections.abc.Sequence[SequenceSweep]):
     num_azimuths: int
     """Firings of each beam a turn."""
     rolling_shutter: bool
-    """Whether the azimuths of a turn are measured one after the other, instead of all at once."""
+    """Whether the azimuths of a turn are measured one after the other, instead of simultaneously."""
     range_noise_m: float
     """Standard deviation of a range, m."""
     dropout: float
     """Share of the returns lost at random."""
     traffic: Traffic
-    """The carrier, everybody else, and what stands around."""
+    """The ego vehicle, everybody else, and what stands around."""
 
     def __len__(self) -> int:
         return self.num_sweeps
@@ -207,7 +207,7 @@ class SyntheticSequence(collections.abc.Sequence[SequenceSweep]):
         Returns:
           (..., 4, 4) float64: `T_world_sensor`.
         """
-        state = self.traffic.carrier.trajectory.at(time_s)
+        state = self.traffic.ego.trajectory.at(time_s)
         pose = np.zeros((*np.shape(time_s), 4, 4))
         pose[..., :3, :3] = self._sway.rotation(np.asarray(time_s), state.heading)
         pose[..., :2, 3] = state.xy
@@ -251,8 +251,8 @@ class SyntheticSequence(collections.abc.Sequence[SequenceSweep]):
     def _in_range(self, times_s: np.ndarray) -> tuple[np.ndarray, list[Kinematics]]:
         """(K,) ids of the vehicles in range at the first of (T,) times, and what they do at all of them."""
         states = [mover.trajectory.at(times_s) for mover in self.traffic.vehicles]
-        carrier = self.traffic.carrier.trajectory.at(times_s[0])
-        distance = np.array([np.hypot(*(state.xy[0] - carrier.xy)) for state in states])
+        ego = self.traffic.ego.trajectory.at(times_s[0])
+        distance = np.array([np.hypot(*(state.xy[0] - ego.xy)) for state in states])
         ids = np.flatnonzero(distance < MAX_RANGE_M)
         return ids, [states[i] for i in ids]
 
@@ -327,7 +327,7 @@ def make_sequence(
     num_sweeps: int = 100,
     rate_hz: float = 10.0,
     rolling_shutter: bool = False,
-    carrier_turns: bool = False,
+    ego_turns: bool = False,
     num_beams: int = NUM_BEAMS,
     num_azimuths: int = SEQUENCE_AZIMUTHS,
     range_noise_m: float = RANGE_NOISE_M,
@@ -335,24 +335,25 @@ def make_sequence(
 ) -> SyntheticSequence:
     """A drive through traffic, swept by a spinning sensor, with exact truth about every vehicle.
 
-    The carrier sways a little. Who drives where and when is drawn from the seed, but all of this happens in
-    the first 10 s, within 50 m:
+    The ego vehicle sways a little. Who drives where and when is drawn from the seed, but all of this happens
+    in the first 10 s, within 50 m:
 
-    - both kinds: a car changes to the left lane, overtakes the carrier and stays ahead; one behind changes to
-      the right; one ahead changes to the right, is hidden behind a van, and changes back to the left;
+    - both kinds: a car changes to the left lane, overtakes the ego vehicle and stays ahead; one behind moves
+      to the right; one ahead changes to the right, is hidden behind a van, and changes back to the left;
       oncoming traffic passes;
     - "street" (30 to 40 km/h): cars stand parked; an oncoming car stops, stands and starts again; another
       turns right into a side street;
-    - "highway" (100 to 110 km/h): the carrier passes a slower truck.
+    - "highway" (100 to 110 km/h): the ego vehicle passes a slower truck.
 
     These have the ids 0 (overtakes), 1 (van), 2 (hidden), 3 (from behind), and then 4 (stops, or the truck)
     and 5 (turns).
 
-    After that everybody in the carrier's direction keeps their distance, and oncoming traffic and parked cars
-    go on. Sequences of up to `MIN_HORIZON_S` of one seed begin in the same way, whatever their length.
+    After that everybody in the ego vehicle's direction keeps their distance, and oncoming traffic and parked
+    cars go on. Sequences of up to `MIN_HORIZON_S` of one seed begin in the same way, whatever their length.
 
     A sweep's reference time, which timestamp, pose and truth are of, is the beginning of its turn. With a
-    rolling shutter the turn begins behind the carrier and runs counter-clockwise, in `NUM_PACKETS` packets.
+    rolling shutter the turn begins behind the ego vehicle and runs counter-clockwise, in `NUM_PACKETS`
+    packets.
 
     Args:
       seed: not negative; the same seed and options give the same bits.
@@ -360,7 +361,7 @@ def make_sequence(
       num_sweeps: how many; 100 show all that is named above.
       rate_hz: turns a second.
       rolling_shutter: whether the points of a turn are measured one after the other.
-      carrier_turns: whether the carrier turns right into a side street, from 9 to 12 s; only on a street.
+      ego_turns: whether the ego vehicle turns right into a side street, from 9 to 12 s; only on a street.
       num_beams: see `scan`, as the rest.
       num_azimuths: firings a turn.
       range_noise_m: standard deviation along the beam, m.
@@ -391,8 +392,8 @@ def make_sequence(
             f"{num_sweeps} sweeps at {rate_hz} Hz last {num_sweeps / rate_hz:.0f} s; at most "
             f"{MAX_DURATION_S:.0f} s can be drawn. Take several seeds."
         )
-    if carrier_turns and kind != "street":
-        raise ValueError(f"carrier_turns is set and kind is {kind!r}; only a street has side streets.")
+    if ego_turns and kind != "street":
+        raise ValueError(f"ego_turns is set and kind is {kind!r}; only a street has side streets.")
     return SyntheticSequence(
         seed=seed,
         kind=kind,
@@ -403,5 +404,5 @@ def make_sequence(
         rolling_shutter=rolling_shutter,
         range_noise_m=range_noise_m,
         dropout=dropout,
-        traffic=draw_traffic(seed, kind, num_sweeps / rate_hz, carrier_turns=carrier_turns),
+        traffic=draw_traffic(seed, kind, num_sweeps / rate_hz, ego_turns=ego_turns),
     )

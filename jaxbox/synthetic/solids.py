@@ -188,7 +188,7 @@ def make_wheel(x: float, y: float, radius_m: float) -> Solid:
 
 WHEEL_WIDTH_M = 0.22
 TYRE_BULGE_M = 0.015
-"""Tyres stand so far out of the sides of the body."""
+"""Tyres stand out of the sides of the body by this much."""
 
 
 def _wheels(axles: Sequence[float], half_width: float, radius_m: float) -> list[Solid]:

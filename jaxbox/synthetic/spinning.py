@@ -1,4 +1,4 @@
-"""A spinning sensor on a moving carrier: how the carrier's body sways, and which beams are fired when."""
+"""A spinning sensor on a moving vehicle: how the ego vehicle's body sways, and which beams are fired when."""
 
 import dataclasses
 
@@ -7,14 +7,14 @@ import numpy as np
 from jaxbox.synthetic.terrain import MAX_RANGE_M
 
 SWAY_DEG = (0.6, 0.3, 0.3)
-"""Greatest yaw, pitch and roll of the carrier's body, degrees: as a car's on a smooth road."""
+"""Greatest yaw, pitch and roll of the ego vehicle's body, degrees: as a car's on a smooth road."""
 SWAY_PERIOD_S = (1.5, 4.0)
 """Of each, s."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Sway:
-    """How the carrier's body turns about its course: three sines."""
+    """How the ego vehicle's body turns about its course: three sines."""
 
     period_s: np.ndarray
     """(3,) float64, s."""
@@ -41,10 +41,10 @@ class Sway:
 
 
 NUM_PACKETS = 48
-"""A turn is fired in so many groups of azimuths, each at one time: 2 ms at 10 turns a second. More take
+"""A turn is fired in this many groups of azimuths, each at one time: 2 ms at 10 turns a second. More take
 longer to cast; a point's time is exact with any number."""
 NUM_SECTORS = 12
-"""Where all azimuths are fired at once."""
+"""Where all azimuths are fired simultaneously."""
 BEARING_MARGIN = np.radians(1.0)
 """Pitch and roll move what a beam meets sideways by less than this."""
 

@@ -182,8 +182,9 @@ def _draw_waves(rng: np.random.Generator) -> tuple[tuple[float, float, float, fl
         number = 2 * np.pi / rng.uniform(25, 70)
         azimuth, phase = rng.uniform(-np.pi, np.pi, 2)
         amplitude = rng.uniform(0.01, 0.02) / number
-        waves.append((amplitude, number * np.cos(azimuth), number * np.sin(azimuth), phase))
-    return tuple(tuple(float(v) for v in wave) for wave in waves)  # pyright: ignore[reportReturnType]
+        along_x, along_y = number * np.cos(azimuth), number * np.sin(azimuth)
+        waves.append((float(amplitude), float(along_x), float(along_y), float(phase)))
+    return tuple(waves)
 
 
 def _draw_crest(rng: np.random.Generator) -> tuple[float, float, float]:

@@ -1,8 +1,8 @@
-"""Traffic round a carrier that drives along a road: who drives how, in two kinds of scenario.
+"""Traffic round an ego vehicle that drives along a road: who drives how, in two kinds of scenario.
 
 Every vehicle has a trajectory in closed form. Each is drawn until it keeps its distance from all that were
 placed before, at all times, so none ever touches another. "Along" is the distance along the road from where
-the carrier starts, "across" the distance left of the road's centre line.
+the ego vehicle starts, "across" the distance left of the road's centre line.
 """
 
 import dataclasses
@@ -33,18 +33,18 @@ from jaxbox.types import Label
 
 TrafficKind = Literal["street", "highway"]
 
-CARRIER_SIZE_M = (4.6, 1.85, 1.6)
+EGO_SIZE_M = (4.6, 1.85, 1.6)
 """Length, width and height of the vehicle that carries the sensor, over its middle."""
 LANE_M = 3.5
 """Width of a lane."""
 TIME_STEP_S = 0.05
-"""Distances are kept at times so far apart; vehicles of one lane come 2 m closer in it at most."""
+"""Distances are kept at times this far apart; vehicles of one lane come 2 m closer in it at most."""
 MIN_HORIZON_S = 20.0
-"""Shorter sequences of a seed have the traffic of one so long, so that each begins like any other."""
+"""Shorter sequences of a seed have the traffic of one of this length, so that each begins like any other."""
 MAX_TRIES = 300
 """Draws of a vehicle of the script until it counts as a fault that there is no room for it."""
 BEHIND_M, BEYOND_M = 60.0, 130.0
-"""The road is lined so far behind the carrier's start, and so far beyond its end."""
+"""The road is lined from this far behind the ego vehicle's start to this far beyond its end."""
 SIDE_STREET_WIDTH_M, SIDE_STREET_M = 9.0, 90.0
 """Width that is left free of clutter, and length of a side street that is lined with it."""
 MOUTH_M = 9.0
@@ -58,13 +58,13 @@ class Setting:
     half_width_m: float
     """Centre line to kerb, m."""
     own_lanes: tuple[float, ...]
-    """Lanes of the carrier's direction, from the right."""
-    carrier_lane: int
-    """Which of them is the carrier's; the script needs the one to the left of it."""
+    """Lanes of the ego vehicle's direction, from the right."""
+    ego_lane: int
+    """Which of them is the ego vehicle's; the script needs the one to the left of it."""
     oncoming_lanes: tuple[float, ...]
     """Lanes of the other direction, from the centre line."""
     speeds: tuple[float, float]
-    """Of the carrier, m/s."""
+    """Of the ego vehicle, m/s."""
     oncoming_speeds: tuple[float, float]
     """m/s."""
     oncoming_gaps_m: tuple[float, float]
@@ -79,7 +79,7 @@ SETTINGS: dict[TrafficKind, Setting] = {
     "street": Setting(
         half_width_m=9.6,
         own_lanes=(-5.25, -1.75),
-        carrier_lane=0,
+        ego_lane=0,
         oncoming_lanes=(1.75, 5.25),
         speeds=(8.5, 11.0),
         oncoming_speeds=(7.5, 9.0),
@@ -90,7 +90,7 @@ SETTINGS: dict[TrafficKind, Setting] = {
     "highway": Setting(
         half_width_m=16.0,
         own_lanes=(-10.75, -7.25, -3.75),
-        carrier_lane=1,
+        ego_lane=1,
         oncoming_lanes=(3.75, 7.25, 10.75),
         speeds=(27.5, 30.5),
         oncoming_speeds=(25.0, 33.0),
@@ -123,7 +123,7 @@ class Traffic:
 
     terrain: Terrain
     """The road."""
-    carrier: Mover
+    ego: Mover
     """The vehicle with the sensor over its middle."""
     vehicles: tuple[Mover, ...]
     """All others; the index is their id."""
@@ -139,7 +139,7 @@ class _Draft:
         self.setting = SETTINGS[kind]
         self.road = Road(
             heading=float(self.rng.uniform(-np.pi, np.pi)),
-            center_offset_m=-self.setting.own_lanes[self.setting.carrier_lane],
+            center_offset_m=-self.setting.own_lanes[self.setting.ego_lane],
             half_width_m=self.setting.half_width_m,
         )
         self.horizon_s = max(duration_s, MIN_HORIZON_S)
@@ -149,7 +149,7 @@ class _Draft:
         self.places: list[tuple[np.ndarray, np.ndarray]] = []
 
     def _draw_cruise(self) -> SpeedProfile:
-        """What the carrier drives where nothing stops it: a speed that wanders a little, then stays."""
+        """What the ego vehicle drives where nothing stops it: a speed that wanders a little, then stays."""
         speed = self.rng.uniform(*self.setting.speeds)
         speeds = speed + self.rng.uniform(-0.5, 0.5, 3)
         return SpeedProfile((0.0, 3.0, 6.0), tuple(speeds.tolist()))
@@ -213,20 +213,20 @@ class _SideStreet:
     """How far it is lined, m from the kerb of the road."""
 
 
-def draw_traffic(seed: int, kind: TrafficKind, duration_s: float, *, carrier_turns: bool) -> Traffic:
-    """Draws what happens round the carrier; see `jaxbox.synthetic.make_sequence`.
+def draw_traffic(seed: int, kind: TrafficKind, duration_s: float, *, ego_turns: bool) -> Traffic:
+    """Draws what happens round the ego vehicle; see `jaxbox.synthetic.make_sequence`.
 
     Args:
       seed: non-negative.
       kind: "street" or "highway".
       duration_s: how long it must last.
-      carrier_turns: whether the carrier leaves the street.
+      ego_turns: whether the ego vehicle leaves the street.
 
     Returns:
       The traffic.
     """
     draft = _Draft(seed, kind, duration_s)
-    side_streets = _place_carrier(draft, turns=carrier_turns)
+    side_streets = _place_ego(draft, turns=ego_turns)
     _place_overtaking(draft)
     _place_hiding(draft)
     _place_merging(draft)
@@ -244,31 +244,31 @@ def draw_traffic(seed: int, kind: TrafficKind, duration_s: float, *, carrier_tur
 
 TURN_RADIUS_M = (6.5, 8.0)
 """Of the middle of a car at a crossing."""
-CARRIER_BRAKES_S, CARRIER_TURNS_S, CARRIER_LEAVES_S = 7.0, 9.0, 12.0
-"""When a carrier that turns brakes, begins to turn, and drives on."""
+EGO_BRAKES_S, EGO_TURNS_S, EGO_LEAVES_S = 7.0, 9.0, 12.0
+"""When an ego vehicle that turns brakes, begins to turn, and drives on."""
 
 
-def _place_carrier(draft: _Draft, *, turns: bool) -> list[_SideStreet]:
-    """The carrier, and the side street that it turns right into."""
-    across = draft.setting.own_lanes[draft.setting.carrier_lane]
+def _place_ego(draft: _Draft, *, turns: bool) -> list[_SideStreet]:
+    """The ego vehicle, and the side street that it turns right into."""
+    across = draft.setting.own_lanes[draft.setting.ego_lane]
     start, course = draft.path(0.0, across)
     speed, turn, streets = draft.cruise, None, []
     if turns:
-        times = (*draft.cruise.times_s, CARRIER_BRAKES_S, CARRIER_TURNS_S, CARRIER_LEAVES_S, 14.0)
+        times = (*draft.cruise.times_s, EGO_BRAKES_S, EGO_TURNS_S, EGO_LEAVES_S, 14.0)
         cruise = draft.cruise.speeds
         speed = SpeedProfile(times, (*cruise, cruise[-1], 5.0, 5.0, 8.0))
-        turn = Turn(float(speed.distance(CARRIER_TURNS_S)), 7.0, -np.pi / 2)
+        turn = Turn(float(speed.distance(EGO_TURNS_S)), 7.0, -np.pi / 2)
         length = float(speed.distance(draft.horizon_s)) - turn.after_m + BEYOND_M
         streets = [_SideStreet(turn.after_m + turn.radius_m + LANE_M / 2, -1, length)]
     path = Trajectory(start, course, speed, turn)
-    draft.place(lambda: Mover(Label.CAR, CARRIER_SIZE_M, (0.5, 0.5, 0.5), path))
+    draft.place(lambda: Mover(Label.CAR, EGO_SIZE_M, (0.5, 0.5, 0.5), path))
     return streets
 
 
 def _place_overtaking(draft: _Draft) -> None:
-    """A car behind the carrier changes to the lane on its left, passes it and stays some metres ahead."""
+    """A car behind the ego vehicle changes to the lane on its left, passes it and stays some metres ahead."""
     rng = draft.rng
-    across = draft.setting.own_lanes[draft.setting.carrier_lane]
+    across = draft.setting.own_lanes[draft.setting.ego_lane]
 
     def draw() -> Mover:
         start, course = draft.path(rng.uniform(-17, -14), across)
@@ -281,11 +281,11 @@ def _place_overtaking(draft: _Draft) -> None:
 
 
 def _place_hiding(draft: _Draft) -> None:
-    """A car changes to the right, before a van that hides it from the carrier for 2 to 3 s, and back."""
+    """A car changes to the right, before a van that hides it from the ego vehicle for 2 to 3 s, and back."""
     rng, setting = draft.rng, draft.setting
-    across = setting.own_lanes[setting.carrier_lane]
+    across = setting.own_lanes[setting.ego_lane]
     size = draw_size(rng, Label.VAN)
-    along = CARRIER_SIZE_M[0] / 2 + rng.uniform(8.0, 11.0) + size[0] / 2
+    along = EGO_SIZE_M[0] / 2 + rng.uniform(8.0, 11.0) + size[0] / 2
     path = Trajectory(*draft.path(along, across), draft.cruise)
     draft.place(lambda: draft.mover(Label.VAN, path, size))
 
@@ -303,9 +303,9 @@ def _place_hiding(draft: _Draft) -> None:
 
 
 def _place_merging(draft: _Draft) -> None:
-    """A car behind, in the lane left of the carrier's, changes to the right and follows the carrier."""
+    """A car behind, in the lane to the left, changes to the right and follows the ego vehicle."""
     rng = draft.rng
-    across = draft.setting.own_lanes[draft.setting.carrier_lane]
+    across = draft.setting.own_lanes[draft.setting.ego_lane]
 
     def draw() -> Mover:
         path = draft.path(rng.uniform(-30.0, -25.0), across + LANE_M)
@@ -316,7 +316,7 @@ def _place_merging(draft: _Draft) -> None:
 
 
 def _place_stop_and_go(draft: _Draft) -> None:
-    """An oncoming car of the inner lane brakes, stands where the carrier passes it, and starts again."""
+    """An oncoming car of the inner lane brakes, stands where the ego vehicle passes it, and starts again."""
     rng = draft.rng
 
     def draw() -> Mover:
@@ -357,11 +357,11 @@ def _place_turning(draft: _Draft) -> _SideStreet:
 
 
 def _place_slow_truck(draft: _Draft) -> None:
-    """The carrier passes a truck in the lane on its right."""
+    """The ego vehicle passes a truck in the lane on its right."""
     rng, setting = draft.rng, draft.setting
 
     def draw() -> Mover:
-        path = draft.path(rng.uniform(24.0, 34.0), setting.own_lanes[setting.carrier_lane - 1])
+        path = draft.path(rng.uniform(24.0, 34.0), setting.own_lanes[setting.ego_lane - 1])
         speed = draft.cruise.plus((0.0,), (rng.uniform(-3.0, -2.4),))
         return draft.mover(Label.TRUCK, Trajectory(*path, speed))
 
@@ -369,7 +369,7 @@ def _place_slow_truck(draft: _Draft) -> None:
 
 
 AHEAD_M, AFTER_M = (44.0, 80.0), (-50.0, -28.0)
-"""Others of the carrier's direction keep these distances from it along the road."""
+"""Others of the ego vehicle's direction keep these distances from it along the road."""
 
 
 def _fill_lanes(draft: _Draft) -> None:

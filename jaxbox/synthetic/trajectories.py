@@ -12,7 +12,7 @@ MOVING_ABOVE, STANDING_BELOW = 1.0, 0.5
 START_STOP_ACCELERATION = 0.8
 """m/s^2: what speeds up or brakes by less neither starts nor stops."""
 STARTING_BELOW, STARTING_WINDOW_S = 3.0, 1.0
-"""m/s and s: a starting vehicle was slower than this so long ago."""
+"""m/s and s: a starting vehicle was slower than this speed, this long ago."""
 STOPPING_BELOW = 4.0
 """m/s: a stopping vehicle is slower."""
 TURNING_RATE, TURNING_ABOVE = math.radians(10.0), 1.5

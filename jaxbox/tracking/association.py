@@ -1,4 +1,4 @@
-"""Which detection belongs to which track: squared Mahalanobis distance, in two stages, best pairs first."""
+"""Assigns detections to tracks: squared Mahalanobis distance, in two stages, best pairs first."""
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ def associate(slots: Slots, seen: Observations, usable: jax.Array, config: Track
     """The detection of each track.
 
     The cost of a pair is d^2 + log det S with the squared Mahalanobis distance d^2 of the positions; pairs
-    are taken in the order of cost, which equals the best assignment as good as always at 10 Hz.
+    are taken in the order of cost, which at 10 Hz nearly always is the optimal assignment.
 
     Args:
       slots: T predicted tracks, in the sensor frame of the sweep.

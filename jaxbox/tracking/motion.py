@@ -11,20 +11,20 @@ from jaxbox.tracking.state import MOMENT_S, NUM_MOMENTS, Slots
 from jaxbox.types import Motion
 
 MEMORY_S = 1.0
-"""Speed and course are compared with those so long ago."""
+"""Speed and course are compared with those this long ago, s."""
 LANE_S = 5.0
-"""A change of lanes is looked for in so long a path,"""
+"""A lane change is looked for in a path of this duration, s;"""
 LANE_END_S = 0.8
-"""and the course at either end is that of so long a piece of it,"""
+"""the course at either end is that of a piece of this duration, s,"""
 LANE_END_M = 2.0
-"""at least this far."""
+"""and at least this length, m."""
 MATURE_HITS = 10
 """Detections after which a velocity is good enough to be compared with an earlier one."""
 FIRST_MOMENTS = 3
 """The velocity at a path's first moments, which begins at 0, is compared with none."""
 SPEED_SDS = 3.0
-"""A vehicle that moves is faster than so many standard deviations of its speed. They are the larger the rarer
-the sweeps: that it starts, with 1.5 m/s2, is said after 1.4 s at 10 Hz and after 2.2 s at 2.5 Hz."""
+"""A vehicle that moves is faster than this many standard deviations of its speed, which grow with the time
+between sweeps: a start at 1.5 m/s2 is detected after 1.4 s at 10 Hz and after 2.2 s at 2.5 Hz."""
 STARTING_SPEED_MPS, STOPPING_SPEED_MPS, TURNING_SPEED_MPS = 3.0, 4.0, 1.5
 """A vehicle starts from below the first, stops below the second, and turns above the third."""
 AGE_TOLERANCE = 0.25
@@ -101,7 +101,7 @@ def classify(slots: Slots, moment_age_s: jax.Array, config: TrackConfig) -> tupl
 
 
 def _moment(moment_age_s: jax.Array, ago_s: float) -> tuple[jax.Array, jax.Array]:
-    """The moment that was so long ago, and whether one was."""
+    """The moment at a time ago, and whether the path has one."""
     index = jnp.argmin(jnp.abs(moment_age_s - ago_s))
     return index, jnp.abs(moment_age_s[index] - ago_s) < AGE_TOLERANCE * ago_s
 
@@ -134,13 +134,13 @@ def _compare_with_earlier(
 
 
 def _offset(way: jax.Array, direction: jax.Array) -> jax.Array:
-    """(T,) float32, m: how far ways end to the left of lines in some directions."""
+    """(T,) float32, m: how far displacements end to the left of lines in some directions."""
     across = direction[:, 0] * way[:, 1] - direction[:, 1] * way[:, 0]
     return across / jnp.maximum(jnp.linalg.norm(direction, axis=1), 1e-6)
 
 
 def _lateral_shift(slots: Slots, moment_age_s: jax.Array, config: TrackConfig) -> jax.Array:
-    """(T,) float32, m: shift across the courses of both ends, 0 where it is no change of lanes."""
+    """(T,) float32, m: shift across the courses of both ends, 0 where lanes are not changed."""
     first, exists = _moment(moment_age_s, LANE_S)
     first_end, _ = _moment(moment_age_s, LANE_S - LANE_END_S)
     last_start, _ = _moment(moment_age_s, LANE_END_S)

@@ -18,7 +18,7 @@ from jaxbox.types import Detections
 VOXEL_M = 2.0
 """Side of a voxel of kiss-icp's map: a third of the time of its own 1 m, and within .1 % of the path."""
 MAX_RANGE_M = 100.0
-"""Farther points are left out of the registration."""
+"""Points beyond this range are not registered."""
 MIN_POINTS = 100
 """Sweeps with fewer points show too little of the scene to be registered."""
 
@@ -28,12 +28,13 @@ MIN_PAIRS = 3
 _GATES_M = (1.5, 1.0, 0.6, 0.4, 0.3, 0.3, 0.3)
 """How far apart two boxes of a pair may be, round by round."""
 _PAIR_STD_M = 0.15
-"""Distance at which a pair weighs half: boxes of one thing move so much from sweep to sweep."""
+"""Distance at which a pair weighs half: as much as the box of a standing object moves from sweep to sweep."""
 _NEAR_M = 5.0
-"""Boxes nearer than this weigh no more than at this distance; farther ones less, as they sway more."""
+"""Boxes nearer than this weigh no more than at this distance; farther ones less,
+because their positions vary more."""
 _GUESS_PAIRS = 5.0
-"""The guess weighs as much as so many pairs: vehicles keep their velocity from sweep to sweep to some .03 m,
-and one pair is good for about .1 m."""
+"""The guess weighs as much as this many pairs: vehicles keep their velocity from sweep to sweep to some
+.03 m, and one pair is good for about .1 m."""
 _GUESS_ARM_M = 10.0
 """Distance from the sensor of the points that stand for the guess, as of a usual box."""
 _SHIFT_CELL_M = 0.5
@@ -41,7 +42,7 @@ _MAX_SHIFT_M = 6.0
 """Of a vehicle at 60 m/s and ten sweeps a second."""
 _MIN_SHARE, _CLEARLY_MORE = 0.3, 1.5
 """Where a smaller share of the boxes finds a partner, the guess may be wrong; it is where another motion
-finds so many times the pairs."""
+finds this many times the pairs."""
 
 
 class TimedSweep(Protocol):
@@ -70,7 +71,7 @@ class KissIcp:
 
         Args:
           voxel_m: side of a voxel of the map, m.
-          max_range_m: farther points are left out, m.
+          max_range_m: points beyond this range are not registered, m.
           num_threads: of the registration; 0 for all cores.
 
         Raises:
@@ -96,7 +97,7 @@ class KissIcp:
         distortion: it is taken to have lasted as long as the sweep.
 
         Args:
-          xyz: (n, 3) real, m, sensor frame; points that are not finite are left out.
+          xyz: (n, 3) real, m, sensor frame; points that are not finite are ignored.
           time_s: (n,) real, s from the sweep's time; None where the points have none, or are compensated.
 
         Returns:
@@ -211,7 +212,7 @@ def ego_motion_from_boxes(
       T_previous_current: (4, 4) float64: a turn about z, and a shift along x and y; the guess where there are
       fewer than `MIN_PAIRS` pairs.
       num_pairs: boxes that agree within 0.3 m; 0 where the guess is the answer. Movers may be among the pairs
-      where nearly everything moves, so few pairs are no proof.
+      where nearly everything moves, so a small number of pairs proves nothing.
     """
     a, b = _centers(previous), _centers(current)
     if min(len(a), len(b)) < MIN_PAIRS:

@@ -98,7 +98,7 @@ def _all_between(flags: np.ndarray, start: np.ndarray, stop: np.ndarray) -> np.n
 def _lateral_shift(
     position: np.ndarray, time: np.ndarray, moving: np.ndarray, paths: Paths, config: TrackConfig
 ) -> np.ndarray:
-    """(I, L) m: shift across the course over the window around each moment, 0 where it is no lane change."""
+    """(I, L) m: shift across the course over the window around each moment, 0 where lanes are not changed."""
     start, stop = _window(time, paths, LANE_S)
     whole = _at(time, stop) - _at(time, start) > (1 - MIN_SHARE / 5) * LANE_S
     steps = (
@@ -123,6 +123,6 @@ def _lateral_shift(
 
 
 def _offset(way: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """(I, L) m: how far ways end to the left of lines in some directions."""
+    """(I, L) m: how far displacements end to the left of lines in some directions."""
     across = direction[..., 0] * way[..., 1] - direction[..., 1] * way[..., 0]
     return across / np.maximum(np.linalg.norm(direction, axis=-1), 1e-6)

@@ -91,7 +91,7 @@ def check_pose(T: np.ndarray) -> str | None:
       T: what may be a rigid transform.
 
     Returns:
-      The reason why it is none: its shape, a number that is not finite, a last row other than 0 0 0 1, a
+      The reason why it is not rigid: its shape, a number that is not finite, a last row other than 0 0 0 1, a
       rotation that is off by more than `ROTATION_TOLERANCE`, or a mirror image; None where it is one.
 
     >>> check_pose(np.eye(4)) is None
@@ -183,7 +183,7 @@ def deskew(
     [9.0, 11.0]
     """
     if problem := check_pose(T_start_end):
-        raise ValueError(f"T_start_end is no motion: {problem}.")
+        raise ValueError(f"T_start_end is not a rigid motion: {problem}.")
     if duration_s is not None and not duration_s > 0:
         raise ValueError(f"duration_s is {duration_s}; it must be positive.")
     moved = np.array(xyz, np.float32)

@@ -14,9 +14,9 @@ from jaxbox.geometry.planar import rotate, wrap_yaw
 from jaxbox.tracking.state import Observations, Slots
 
 MAX_YAW_POINTS = 300.0
-"""More points make a detection's yaw no surer,"""
+"""More points than this add nothing to the weight of a detection's yaw,"""
 MAX_SIZE_POINTS = 500.0
-"""and its size."""
+"""and more than this nothing to that of its size."""
 CROSSED_WEIGHT = 1e-3
 """Weight of the size of a detection whose length lies across the track's, and of one without points."""
 MATURE_HITS = 3
@@ -190,7 +190,7 @@ def is_crossed(seen_yaw: jax.Array, yaw: jax.Array) -> jax.Array:
 
 
 def front_of(yaw: jax.Array, front_vote: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Where the front of a box points, and how sure that is.
+    """Finds where the front of a box points, and with what probability.
 
     Args:
       yaw: (T,) float32, rad, in [-pi/2, pi/2), of the length axis.

@@ -31,13 +31,13 @@ from jaxbox.types import Motion
 MAX_GAP_S = 0.8
 """Longer gaps between two detections are not filled."""
 MIN_EXTENTS = 5
-"""From so many extents on, a track is at least as long as a quantile of them."""
+"""From this many extents on, a track is at least as long as a quantile of them."""
 YAW_MEMORY_S = 0.4
 """A moving vehicle's yaw is a vote in which a detection counts exp(-t / this) at a time t from it."""
 COURSE_SHARE = 0.5
 """At speeds at which the course has a vote for the yaw, it is this share of all the others."""
 MOVING_DISTANCE_M = 1.5
-"""A track moves where its way is longer, m, and its median speed is that of one that moves."""
+"""A track moves where its path is longer than this, m, and its median speed is that of a moving one."""
 TRACK_SHARE = 0.75
 """Share of the track's mean score in the logarithm of a detection's; the rest is its own."""
 
@@ -165,7 +165,7 @@ def _vote_yaw(paths: Paths, velocity: np.ndarray, config: TrackConfig) -> np.nda
 
 
 def _is_moving(paths: Paths, speed: np.ndarray, config: TrackConfig) -> np.ndarray:
-    """(I,) bool: whether tracks move at all, by their median speed and their way."""
+    """(I,) bool: whether tracks move at all, by median speed and length of path."""
     last = paths.length[:, None, None] - 1
     way = np.take_along_axis(paths.center[..., :2], last, axis=1)[:, 0] - paths.center[:, 0, :2]
     median = np.nanmedian(np.where(paths.valid, speed, np.nan), axis=1)

@@ -1,4 +1,4 @@
-"""What a tracker remembers, and what it reads of a sweep: frozen pytrees of a fixed shape.
+"""The state of a tracker, and what it reads of a sweep: frozen pytrees of a fixed shape.
 
 The memory is in the sensor frame of the last sweep, and moves with it: no world enters, so that a recording
 of an hour, or one in UTM coordinates, loses nothing in float32.
@@ -31,7 +31,7 @@ class Observations:
     size: jax.Array
     """(D, 3) float32, m: length >= width, height."""
     yaw: jax.Array
-    """(D,) float32, rad: length axis, any turn."""
+    """(D,) float32, rad: length axis, not wrapped."""
     score: jax.Array
     """(D,) float32, in [0, 1]."""
     label: jax.Array

@@ -14,7 +14,7 @@ from jaxbox.config import Label, TrackConfig
 from jaxbox.geometry.planar import rotate, wrap_yaw
 from jaxbox.tracking import kalman, motion, shape
 from jaxbox.tracking.association import associate, position_variance
-from jaxbox.tracking.carrier import Interval, check_interval, to_current_frame
+from jaxbox.tracking.ego_motion import Interval, check_interval, to_current_frame
 from jaxbox.tracking.state import Observations, Slots, TrackerState, empty_slots
 from jaxbox.tracking.tracks import FREE, Sight, TrackCounts, Tracks, TrackStatus
 from jaxbox.tracking.visibility import is_hidden
@@ -39,7 +39,7 @@ def track_step(
       seen: D detections of this sweep, in its sensor frame; see `observe`.
       dt: () float32, s since the last sweep; not read for the first one.
       T_previous_current: (4, 4) float32: from this sweep's sensor frame to the last one's, so the way of
-        the carrier; the identity where it is not known. Not read for the first sweep.
+        the ego vehicle; the identity where it is not known. Not read for the first sweep.
       config: of the tracker; None for the defaults.
 
     Returns:
@@ -50,8 +50,7 @@ def track_step(
     Reference: oracle `jaxbox.reference.tracking.track_step`; Kalman (1960) with the constant-velocity model;
     two stages as ByteTrack (Zhang et al., 2022).
     """
-    config = TrackConfig() if config is None else config
-    config = TrackConfig(**{name: jnp.asarray(value, jnp.float32) for name, value in vars(config).items()})
+    config = _as_arrays(TrackConfig() if config is None else config)
     interval = check_interval(jnp.asarray(dt, jnp.float32), T_previous_current, state.started, config)
     seen = _with_rows(seen)
     order = jnp.argsort(-jnp.where(seen.valid, seen.score, -jnp.inf), stable=True)
@@ -74,6 +73,11 @@ def track_step(
     return after, _answer(after, seen, row, order, counts, interval, config)
 
 
+def _as_arrays(config: TrackConfig) -> TrackConfig:
+    """Thresholds as float32, so that Python's numbers and arrays are one program."""
+    return jax.tree.map(lambda value: jnp.asarray(value, jnp.float32), config)
+
+
 class Fates(NamedTuple):
     """What becomes of each detection; a valid one is in exactly one of these, each (D,) bool."""
 
@@ -82,7 +86,7 @@ class Fates(NamedTuple):
     new: jax.Array
     """Begins a track, if a slot is free."""
     inside: jax.Array
-    """Its centre lies in the box of a track, so that it is no other vehicle."""
+    """Its centre lies in the box of a track: it is a duplicate of that vehicle."""
     low: jax.Array
     """Its score is too low to begin a track."""
     invalid: jax.Array
@@ -90,7 +94,7 @@ class Fates(NamedTuple):
 
 
 def _with_rows(seen: Observations) -> Observations:
-    """The detections, and where there is no row one that is not valid, as nothing is taken of no rows."""
+    """The detections; an empty list gets one invalid row, because gathers need at least one."""
     if seen.valid.shape[0] > 0:
         return seen
     rows = jax.tree.map(lambda a: jnp.zeros((1, *a.shape[1:]), a.dtype), seen)
@@ -113,7 +117,7 @@ def _end_all(slots: Slots, ends: jax.Array) -> Slots:
 
 
 def predict(slots: Slots, dt: jax.Array, config: TrackConfig) -> Slots:
-    """Where tracks are expected after a time: on at their velocity, and turned at their turn rate.
+    """Predicts tracks at constant velocity and turn rate.
 
     Args:
       slots: T tracks.
@@ -137,7 +141,7 @@ def predict(slots: Slots, dt: jax.Array, config: TrackConfig) -> Slots:
 def update(
     slots: Slots, seen: Observations, detection: jax.Array, dt: jax.Array, config: TrackConfig
 ) -> Slots:
-    """What tracks learn from their detections; the others miss theirs.
+    """Updates tracks with their detections, and counts a miss for the others.
 
     Args:
       slots: T predicted tracks.
@@ -207,7 +211,7 @@ def _is_confirmed(slots: Slots, config: TrackConfig) -> jax.Array:
 
 
 def forget(slots: Slots, first_return_m: jax.Array, config: TrackConfig) -> Slots:
-    """Ends tracks that miss their detections: soon where they would be visible, later where they are hidden.
+    """Ends tracks without detections: soon where they would be visible, later where they are hidden.
 
     Args:
       slots: T tracks after the sweep.
@@ -233,7 +237,7 @@ def forget(slots: Slots, first_return_m: jax.Array, config: TrackConfig) -> Slot
 def sort_detections(
     slots: Slots, seen: Observations, finite: jax.Array, detection: jax.Array, config: TrackConfig
 ) -> Fates:
-    """What becomes of each detection.
+    """Says what becomes of each detection.
 
     Args:
       slots: T tracks that live on.

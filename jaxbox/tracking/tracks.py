@@ -58,15 +58,15 @@ _STATUS_TEXT = {
     "over and the tracks are as they were. Sort the sweeps by time and drop doubled ones.",
     TrackStatus.TIME_GAP: "more than TrackConfig.max_gap_s passed since the sweep before; all tracks ended, "
     "and new ones began.",
-    TrackStatus.POSE_INVALID: "the pose is not finite or no rotation; the carrier was taken to stand. Check "
-    "the source of the poses.",
-    TrackStatus.POSE_JUMP: "the pose moved faster than TrackConfig.max_carrier_speed_mps; all tracks ended, "
+    TrackStatus.POSE_INVALID: "the pose is not finite or not a rigid transform; the ego vehicle was taken to "
+    "stand. Check the source of the poses.",
+    TrackStatus.POSE_JUMP: "the pose moved faster than TrackConfig.max_ego_speed_mps; all tracks ended, "
     "and new ones began. Check the source of the poses.",
-    TrackStatus.INVALID_DETECTIONS: "detections with NaN or infinite numbers were left out.",
+    TrackStatus.INVALID_DETECTIONS: "detections with NaN or infinite numbers were ignored.",
     TrackStatus.POSE_FROM_BOXES: "no poses were given, so they were estimated from the boxes, to some "
     "centimetres a sweep; velocities are as good as that.",
-    TrackStatus.POSE_UNKNOWN: "no poses were given or found, so the carrier was taken to stand: velocities "
-    "are relative to it, and what stands seems to move.",
+    TrackStatus.POSE_UNKNOWN: "no poses were given or found, so the ego vehicle was taken to stand: "
+    "velocities are relative to it, and what stands seems to move.",
 }
 
 
@@ -244,19 +244,18 @@ class Tracks(BoxRows[Track]):
     def to_columns(self) -> dict[str, np.ndarray]:
         """Columns as `jaxbox.io.parquet` has them: ``id`` first, then those of boxes, state and velocity."""
         tracks = self[:]
-        words = {
-            "state": np.array([Motion(motion).word for motion in tracks.motion.tolist()], str),
-            "sight": np.array([Sight(sight).name.lower() for sight in tracks.sight.tolist()], str),
-        }
-        same = ("confirmed", "age", "hits")
         return {
             "id": np.asarray(tracks.id),
             **super().to_columns(),
-            **words,
-            **{name: np.asarray(getattr(tracks, name)) for name in same},
+            "state": np.array([Motion(motion).word for motion in tracks.motion.tolist()], str),
+            "sight": np.array([Sight(sight).name.lower() for sight in tracks.sight.tolist()], str),
+            "confirmed": np.asarray(tracks.confirmed),
+            "age": np.asarray(tracks.age),
+            "hits": np.asarray(tracks.hits),
             **dict(zip(("velocity_x", "velocity_y"), np.asarray(tracks.velocity).T, strict=True)),
             "speed": np.asarray(tracks.speed),
-            **{name: np.asarray(getattr(tracks, name)) for name in ("turn_rate", "lateral_shift_m")},
+            "turn_rate": np.asarray(tracks.turn_rate),
+            "lateral_shift_m": np.asarray(tracks.lateral_shift_m),
         }
 
     def to_kitti(

@@ -35,7 +35,7 @@ def is_hidden(
     share = jnp.linspace(0.0, 1.0, NUM_RAYS, dtype=jnp.float32)
     azimuth = middle[:, None] + low[:, None] + (high - low)[:, None] * share[None]
     cell = jnp.floor((azimuth / TURN + 0.5) * num_azimuths).astype(jnp.int32) % num_azimuths
-    # Of the whole outline: a long vehicle abreast of the sensor is much nearer than its corners.
+    # Of the whole outline: a long vehicle next to the sensor is much nearer than its corners.
     outside = jnp.maximum(jnp.abs(rotate(-center, -yaw)) - size / 2, 0)
     nearest = jnp.linalg.norm(outside, axis=1)
     is_before = first_return_m[cell] < nearest[:, None] - config.hidden_gap_m

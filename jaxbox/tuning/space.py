@@ -80,7 +80,7 @@ def parse_axis(config: DetectorConfig, text: str) -> Axis:
       The axis.
 
     Raises:
-      ValueError: for another form, a field that is static or unknown, or a range that is none.
+      ValueError: for another form, a field that is static or unknown, or an empty range.
 
     >>> parse_axis(DetectorConfig(), "vehicles.ring_weight=2:16:log")
     Axis(name='vehicles.ring_weight', low=2.0, high=16.0, log=True)

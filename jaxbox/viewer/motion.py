@@ -21,7 +21,7 @@ def shown_groups(tracked: TrackedFrame, *, min_score: float) -> dict[int, BoxGro
 
     Args:
       tracked: of the sweep.
-      min_score: tracks that score less are left out.
+      min_score: tracks that score less are hidden.
 
     Returns:
       A group a track, see `jaxbox.viz.tracks.track_groups`, by its row of `TrackedFrame.tracks`; darker where

@@ -20,7 +20,7 @@ GROUND_COLOR: Color = (120, 100, 80)
 OBSTACLE_COLOR: Color = (120, 215, 255)
 """Points above it."""
 CAPTION_GAP_M = 0.3
-"""Captions stand so high above their boxes, and those of labels hang so far below: none hides the other."""
+"""Distance of captions above their boxes, and of those of labels below, so that neither hides the other."""
 _INTENSITY_TOP = 99.0
 """Percentile of the intensities that has the highest colour: a few mirrors outshine everything."""
 _LOW_PERCENTILE = 5.0

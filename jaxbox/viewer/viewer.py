@@ -1,7 +1,7 @@
 """The loop that keeps a page in step with what its user asks for.
 
-The page's events only say what is wanted; one thread answers. While it detects, wishes pile up to one, the
-last: a slider that is dragged shows as many answers as there is time for, and none of them late.
+The page's events only record what is requested; one thread answers. While it detects, only the last request
+is kept: a slider that is dragged shows as many results as there is time for, and none of them late.
 """
 
 import dataclasses

@@ -27,7 +27,7 @@ LOW_M, HIGH_M = -0.3, 3.0
 _DARK, _SHADES = (52, 56, 64), 84
 
 PALETTE_SIZE = 512
-"""Ids so far apart share a colour."""
+"""Ids that differ by a multiple of this share a colour."""
 GOLDEN_TURN = 0.61803398875
 """Hues that advance by this share of the circle never come close for neighbouring ids."""
 

@@ -14,7 +14,7 @@ from jaxbox.viz.colors import Color, color_by_id, shade_by_height
 from jaxbox.viz.image_boxes import draw_image_boxes, scale_camera
 
 ARROW_S = 1.0
-"""The arrow of a velocity ends where the vehicle is after so long a time."""
+"""The arrow of a velocity ends where the vehicle is after this time."""
 MIN_FRONT_PROBABILITY = 0.75
 """From this P(front) on the front is marked: the heading of what never moved is a guess."""
 _HEAD_M = 1.2

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 
 
 def fast_max(a: Any, b: Any) -> jax.Array:
-    """The greater of two numbers, neither of which is NaN. Law: `jnp.maximum`.
+    """The maximum of two numbers, neither of which is NaN. Law: `jnp.maximum`.
 
-    `jnp.maximum` hands NaN on, for which XLA takes five instructions on a CPU instead of one: this is for
+    `jnp.maximum` propagates NaN, for which XLA takes five instructions on a CPU instead of one: this is for
     loops that do little else.
 
     >>> fast_max(jnp.array([1, 3]), 2).tolist()
@@ -20,7 +20,7 @@ def fast_max(a: Any, b: Any) -> jax.Array:
 
 
 def fast_min(a: Any, b: Any) -> jax.Array:
-    """The lesser of two numbers, neither of which is NaN; see `fast_max`. Law: `jnp.minimum`.
+    """The minimum of two numbers, neither of which is NaN; see `fast_max`. Law: `jnp.minimum`.
 
     >>> fast_min(jnp.array([1, 3]), 2).tolist()
     [1, 2]

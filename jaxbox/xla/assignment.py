@@ -5,9 +5,9 @@ import jax.numpy as jnp
 
 
 def assign_greedily(cost: jax.Array, allowed: jax.Array) -> jax.Array:
-    """Pairs of rows and columns, each in one pair at most, those of the least cost first.
+    """Matches rows with columns greedily, each in one pair at most, least cost first.
 
-    Law: as taking the least allowed cost of all again and again, its row and column then being gone.
+    Law: as taking the pair of the least allowed cost and removing its row and column, until none is left.
 
     Each round takes all pairs that are the least of their row and of their column: where costs tie, of the
     first row and then of the first column. The least of all is one, so that every round takes a pair; two or

@@ -14,10 +14,9 @@ def materialize(values: Any) -> Any:
 
     Law: the identity.
 
-    XLA fuses a producer into each of its consumers. A loop is a wall that fusion does not cross, even one of
-    no turn: barriers keep the compiler from seeing that it has none, and that a turn would change nothing.
-    (A conditional would copy what goes through it.) There are no walls on an accelerator, whose host would
-    wait at each.
+    XLA fuses a producer into each of its consumers. Fusion does not cross a loop, even one of no iteration:
+    barriers keep the compiler from seeing that it has none, and that one would change nothing. (A conditional
+    would copy what goes through it.) On an accelerator, whose host would wait at each loop, nothing is done.
 
     Args:
       values: pytree of arrays.
@@ -50,7 +49,7 @@ def opaque_zeros(*shape: int) -> jax.Array:
 
 
 def outline(function: Callable[..., Any], *operands: Any) -> Any:
-    """Calls a function in a room of its own: its scratch memory lives while it runs, and no longer.
+    """Calls a function in a scope of its own: its scratch memory lives only while it runs.
 
     Law: ``function(*operands)``.
 
@@ -77,7 +76,7 @@ def single_kernel(function: Callable[..., Any], *operands: Any) -> Any:
 
     Law: ``function(*operands)``.
 
-    XLA compiles so small a loop, here of one turn, to native code on the CPU, see
+    XLA compiles a loop this small, here of one iteration, to native code on the CPU, see
     `chunks.SINGLE_KERNEL_NUMBERS`. On an accelerator the function is simply called.
 
     Args:

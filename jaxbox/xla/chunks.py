@@ -1,7 +1,7 @@
 """The one table of chunk sizes: how much is worked on at a time, on a CPU unless it says otherwise.
 
-None of them changes a result. A chunk is large enough for wide vectors and few turns of a loop, and small
-enough for its scratch memory to stay in the cache; with one row at a time XLA compiles a loop to native code.
+None of them changes a result. A chunk is large enough for wide vectors and few iterations, and small enough
+for its scratch memory to stay in the cache; with one row at a time XLA compiles a loop to native code.
 ``python -m benchmarks.bench_chunks NAME`` times a size against its half and its double on real sweeps, in the
 step that it names; for sizes that it does not vary it names what chose them. What came of it is in
 docs/notes/kernels_on_cpu.md, and for accelerators in docs/notes/accelerators.md.
@@ -39,7 +39,7 @@ VOTES = 64
 """Votes for the scene's direction at a time: few boxes of a sweep vote."""
 
 PROPOSALS = 256
-"""Proposals held against the evidence at a time: a loop over their points has few, wide steps."""
+"""Proposals compared with the evidence at a time: a loop over their points has few, wide steps."""
 
 RAYS = 128
 """Boxes that rays are cast over at a time, for votes as for scores: equal kernels are compiled once
@@ -64,12 +64,12 @@ FOLDED_POINTS = 4
 """Points of each cluster folded in one step of the loop over them."""
 
 UNROLLED = 4, 3, 2, 1
-"""Numbers taken in one turn of a native loop, the most that leave no remainder, which would take kernels of
-its own. Four are twice as fast as one."""
+"""Numbers taken in one iteration of a native loop, the most that leave no remainder, which would take
+kernels of its own. Four are twice as fast as one."""
 
 SUM_BLOCK = 512
 """Columns of sums in two levels, on an accelerator."""
 
 SINGLE_KERNEL_NUMBERS = 62
-"""Numbers that `jaxbox.xla.barriers.single_kernel` may copy: what reads and writes more than a kilobyte is no
-small loop to XLA."""
+"""Numbers that `jaxbox.xla.barriers.single_kernel` may copy: to XLA a loop that reads and writes more than a
+kilobyte is not small."""

@@ -243,7 +243,7 @@ def _by_map(row: CellGrids, cell: jax.Array) -> list[jax.Array]:
     return steps
 
 
-def _beside(row: CellGrids, cell: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
+def _touching_cells(row: CellGrids, cell: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
     """Where a run that starts at each cell may touch others: on each line before it, and on each line after.
 
     Two runs touch first where the one on the later line starts: then the other holds that cell of its line
@@ -277,7 +277,7 @@ class _Runs:
 def _join_sequential(row: CellGrids, runs: _Runs) -> jax.Array:
     """(C,) int32: the lowest node of each node's component, by a union-find, link after link.
 
-    XLA compiles so small loops to native code on the CPU.
+    XLA compiles loops this small to native code on the CPU.
     """
 
     def find_root(node: jax.Array, parent: jax.Array) -> jax.Array:
@@ -287,13 +287,13 @@ def _join_sequential(row: CellGrids, runs: _Runs) -> jax.Array:
         return parent.at[node].set(root, mode="promise_in_bounds")
 
     def join(side: int, k: int, node: jax.Array, parent: jax.Array) -> jax.Array:
-        cell = _beside(row, lookup(runs.cell, node))[side][k]
+        cell = _touching_cells(row, lookup(runs.cell, node))[side][k]
         touches, other = runs.look(row, side, cell, node)
 
         def unite(_: jax.Array, parent: jax.Array) -> jax.Array:
             ends = find_root(node, parent), find_root(other, parent)
             low = jnp.minimum(*ends)
-            # The node itself, too, so that its way to the root is short.
+            # The node itself, too, so that its path to the root is short.
             return set_parent(set_parent(parent, jnp.maximum(*ends), low), node, low)
 
         # A conditional would copy all parents.
@@ -317,7 +317,7 @@ def _join_in_rounds(row: CellGrids, runs: _Runs) -> jax.Array:
         touches, other = runs.look(row, side, cell, itself)
         return jnp.where(touches, other, itself)
 
-    sides = enumerate(_beside(row, runs.cell))
+    sides = enumerate(_touching_cells(row, runs.cell))
     links = [link(side, cell) for side, cells in sides for cell in cells]
     node, other = jnp.tile(itself, len(links)), jnp.concatenate(links)
 

@@ -25,7 +25,7 @@ def lower_hulls(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.A
     if on_accelerator():
         return _lower_hulls_parallel(x, y)
     far = jnp.inf
-    x, y = materialize((x, y))  # Each turn of the loop reads them.
+    x, y = materialize((x, y))  # Each iteration of the loop reads them.
 
     def step(state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         i, _, chain_x, chain_y = state
@@ -57,8 +57,8 @@ def lower_hulls(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.A
 def _lower_hulls_parallel(x: jax.Array, y: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """As `lower_hulls`, by all pairs of points, which is one kernel on an accelerator.
 
-    A point is a vertex where the steepest way to it from the left is less steep than the flattest way on to
-    the right. From a point below the way is infinitely steep; of points in one place the first counts.
+    A point is a vertex where the largest slope to it from the left is less than the smallest slope on to the
+    right. From a point below the slope is infinite; of points in one place the first counts.
     """
     far, num_points = jnp.float32(jnp.inf), x.shape[0]
     index, row = (jnp.arange(size, dtype=jnp.int32)[:, None] for size in (num_points, num_points + 1))

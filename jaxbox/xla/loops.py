@@ -19,13 +19,14 @@ def for_chunks(
     *,
     capacity: int | None = None,
 ) -> Any:
-    """Calls a step with each chunk of the rows that count, one after the other.
+    """Calls a step with each chunk of the valid rows, one after the other.
 
     Law: ``for start in range(0, num_rows, chunk): state = step(start, state)``.
 
     The loop counts rows and not chunks, and without a sign: to divide, to multiply, and to look whether an
-    index counts from the end would be a kernel each (XLA, CPU). On an accelerator the first chunk is done
-    unasked, since its host waits for each answer: where no row counts, the step must do nothing.
+    index counts from the end would be a kernel each (XLA, CPU). On an accelerator the first chunk is
+    processed without a test, since its host waits for each result: where no row counts, the step must do
+    nothing.
 
     Args:
       num_rows: () int32, how many rows count.
@@ -187,7 +188,7 @@ def map_batches(function: Callable[[jax.Array], jax.Array], rows: jax.Array, *, 
 
 
 def repeat(function: Callable[[Any], Any], state: Any, times: int) -> Any:
-    """Applies a function again and again. Law: ``f(f(... f(state)))``.
+    """Applies a function a number of times. Law: ``f(f(... f(state)))``.
 
     Args:
       function: of the state.

@@ -121,7 +121,7 @@ def fold_points(
     absent: tuple[Any, Any],
     reduce: Callable[..., jax.Array] = jnp.sum,
 ) -> Any:
-    """Sums up the points of many clusters, or finds what is greatest among them.
+    """Reduces the points of many clusters to sums or maxima.
 
     Law: `update` sees each point that counts once, with its cluster.
 

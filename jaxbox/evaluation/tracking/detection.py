@@ -1,7 +1,7 @@
 """Detection figures of the same boxes, so that single sweeps and tracks stand side by side.
 
 Boxes take objects in the order of their scores: each the object of best overlap that is free, one that counts
-if there is any. A box of an object that does not count is left out, and so is one of no object where nobody
+if there is any. A box of an object that does not count is ignored, and so is one of no object where nobody
 labelled; a second box of the same object is wrong, as in KITTI's protocol.
 Precision and recall are those of all boxes from a score on, so boxes of one score come in together.
 """
@@ -19,7 +19,7 @@ FIGURES = (("bev", 0.5), ("3d", 0.7))
 """Metric and overlap of the figures that are reported."""
 
 PRECISIONS = (0.90, 0.95)
-"""Recall is reported where precision is at least so much."""
+"""Recall is reported where precision is at least this."""
 
 _NUM_SAMPLES = 40
 _RIGHT, _WRONG, _LEFT_OUT = 1, 0, -1
@@ -119,7 +119,7 @@ def detection_curve(
 
 
 def _outcomes(frame: JudgedFrame, metric: str, min_overlap: float) -> np.ndarray:
-    """(B,) whether each box is right, wrong or left out."""
+    """(B,) whether each box is right, wrong or ignored."""
     counts = np.asarray(frame.truth.counts, bool)
     free = np.where(frame.overlaps[metric] >= min_overlap - EPSILON, frame.overlaps[metric], 0)
     outcome = np.where(frame.excused, _LEFT_OUT, _WRONG)

@@ -21,7 +21,7 @@ from jaxbox.types import Detections
 _NS_PER_S = 10**9
 
 
-class Carrier(Protocol):
+class PoseProvider(Protocol):
     """A source of poses for the sweeps of one sequence."""
 
     source: PoseSource
@@ -41,7 +41,7 @@ def estimated_source() -> PoseSource:
     return PoseSource.KISS_ICP if importlib.util.find_spec("kiss_icp") else PoseSource.BOXES
 
 
-def make_carrier(poses: Poses | np.ndarray | PoseSource | str | None) -> Carrier:
+def make_pose_provider(poses: Poses | np.ndarray | PoseSource | str | None) -> PoseProvider:
     """The source of poses that was asked for.
 
     Args:
@@ -87,7 +87,7 @@ class GivenPoses:
         return Deskewed(sweep, relative_rigid(pair[0], pair[1]))
 
     def locate(self, index: int, detections: Detections) -> np.ndarray:
-        """The pose as it was given, which may be no pose at all."""
+        """The pose as it was given, which may be invalid."""
         return self._T_world_sensor[index]
 
 
@@ -136,7 +136,7 @@ class RegisteredBoxes:
         return sweep
 
     def locate(self, index: int, detections: Detections) -> np.ndarray:
-        """The pose before, and the motion since then."""
+        """The previous pose, and the motion since then."""
         if self._before is not None:
             self._motion, _ = ego_motion_from_boxes(self._before, detections, self._motion)
             self._T_world_sensor = self._T_world_sensor @ self._motion
@@ -163,7 +163,7 @@ ESTIMATED = {
     PoseSource.BOXES: RegisteredBoxes,
     PoseSource.NONE: Standing,
 }
-"""Sources that are no file, by the words that ask for them."""
+"""Sources other than files, by the words that ask for them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,7 +173,7 @@ class Deskewed:
     sweep: ReadableSweep
     """As it lies in its file."""
     T_start_end: np.ndarray
-    """(4, 4) float64: the way of the sensor to the next sweep."""
+    """(4, 4) float64: the motion of the sensor to the next sweep."""
 
     @property
     def name(self) -> str:
@@ -253,12 +253,12 @@ class Clock:
         return known
 
 
-def prepared(sweeps: Iterable[ReadableSweep], carrier: Carrier, begun: Any) -> Iterator[ReadableSweep]:
+def prepared(sweeps: Iterable[ReadableSweep], provider: PoseProvider, begun: Any) -> Iterator[ReadableSweep]:
     """Hands sweeps out as they are to be read, and notes the sweeps themselves.
 
     Args:
       sweeps: of one sequence.
-      carrier: source of the poses.
+      provider: source of the poses.
       begun: a deque, to which each sweep is added when it is handed out.
 
     Yields:
@@ -266,4 +266,4 @@ def prepared(sweeps: Iterable[ReadableSweep], carrier: Carrier, begun: Any) -> I
     """
     for index, sweep in enumerate(sweeps):
         begun.append(sweep)
-        yield carrier.prepare(index, sweep)
+        yield provider.prepare(index, sweep)

@@ -1,4 +1,4 @@
-"""How the sensor moved since the last sweep, and whether time and pose can be believed."""
+"""How the sensor moved since the last sweep, and whether time and pose are plausible."""
 
 import dataclasses
 import math
@@ -15,7 +15,7 @@ from jaxbox.types import combine_bits
 RIGID_TOLERANCE = 1e-3
 """Entries of R R^T may differ from those of the identity by this."""
 MAX_TURN_RAD_PER_S = math.radians(180)
-"""No carrier turns faster."""
+"""No vehicle turns faster."""
 
 
 @jax.tree_util.register_dataclass
@@ -30,7 +30,7 @@ class Interval:
     translation: jax.Array
     """(3,) float32, m: the current sensor in the previous frame."""
     skipped: jax.Array
-    """() bool: the sweep is to be passed over."""
+    """() bool: the sweep is skipped."""
     restarts: jax.Array
     """() bool: all tracks end."""
     status: jax.Array
@@ -45,7 +45,7 @@ class Interval:
 def check_interval(
     dt: jax.Array, T_previous_current: jax.Array, started: jax.Array, config: TrackConfig
 ) -> Interval:
-    """Judges time and pose: what cannot be believed is replaced, and said.
+    """Checks time and pose: what is not plausible is replaced, and a status bit is set.
 
     Args:
       dt: () float32, s since the last sweep; not read for the first one.
@@ -62,7 +62,7 @@ def check_interval(
     is_rigid = _is_rigid(rotation) & jnp.all(jnp.isfinite(translation))
     dt = jnp.where(started & is_later, dt, 0.1)
     distance, turn = jnp.linalg.norm(translation), _angle(rotation)
-    is_jump = (distance > config.max_carrier_speed_mps * dt) | (turn > MAX_TURN_RAD_PER_S * dt)
+    is_jump = (distance > config.max_ego_speed_mps * dt) | (turn > MAX_TURN_RAD_PER_S * dt)
     usable = started & is_rigid & ~is_jump & ~is_gap
     skipped = started & ~is_later
     bits = {
@@ -93,7 +93,9 @@ def _angle(rotation: jax.Array) -> jax.Array:
 
 
 def to_current_frame(slots: Slots, interval: Interval) -> Slots:
-    """Sees all that is remembered from where the sensor is now. The covariance is the same in any frame.
+    """Transforms the state of all tracks to the current sensor frame.
+
+    The covariance is the same in any frame.
 
     Args:
       slots: in the sensor frame of the last sweep.
