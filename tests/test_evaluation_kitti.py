@@ -63,6 +63,29 @@ def r40(labels, results, metric="3d", difficulty="moderate", class_name="Car"):
     return kitti.evaluate(labels, results).curve(class_name, metric, difficulty).r40
 
 
+def test_vehicles_of_any_class_are_judged_as_cars_are():
+    words = ("Car", "Van", "Truck", "Tram")
+    labels = {name: [car(type=words[i % 4])] for i, name in enumerate(lone_cars(60))}
+    found_as = {name: [car(type=words[i % 3])] for i, name in enumerate(labels)}
+    found = scored(shifted(found_as, 0.9) | {"000007": [], "000011": shifted(found_as, 9)["000011"]})
+    overlap = {kitti.VEHICLE: kitti.VEHICLE_OVERLAP}
+    merged = kitti.evaluate(kitti.as_vehicles(labels), kitti.as_vehicles(found), min_overlap=overlap)
+    cars = changed(labels, type="Car"), changed(found, type="Car")
+    of_cars = kitti.evaluate(*cars, min_overlap={"Car": kitti.VEHICLE_OVERLAP})
+    assert [curve.r40 for curve in merged.curves] == [curve.r40 for curve in of_cars.curves]
+    assert 0 < merged.curve(kitti.VEHICLE, "3d", "moderate").r40 < 100
+
+
+def test_people_are_no_vehicles_and_trailers_excuse_them():
+    labels = {"a": [car(type="Pedestrian"), car(type="Misc")], "b": [car()]}
+    assert [item.type for items in kitti.as_vehicles(labels).values() for item in items] == [
+        "Pedestrian", "Misc", "Vehicle",
+    ]  # fmt: skip
+    found = kitti.as_vehicles(scored({"a": [car()], "b": [car()]}))
+    curve = kitti.evaluate(kitti.as_vehicles(labels), found, min_overlap={kitti.VEHICLE: 0.5}).curves[-1]
+    assert (curve.num_labels, curve.r40) == (1, curve.to_dict()["ceiling_r40"])
+
+
 @pytest.mark.parametrize("answers", ["perturbed", "perfect", "borderline"])
 def test_every_curve_is_that_of_the_official_evaluator(data_root, answers):
     folder = data_root / "kitti_eval_oracle" / answers

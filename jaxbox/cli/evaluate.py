@@ -14,6 +14,7 @@ from jaxbox._files import check_no_link
 from jaxbox.cli.eval_pictures import write_judged_pictures
 from jaxbox.cli.report import make_table
 from jaxbox.evaluation import evaluate_folders
+from jaxbox.evaluation.kitti import VEHICLE_OVERLAP
 from jaxbox.evaluation.report import read_folders
 from jaxbox.io import atomic_writer, open_sweeps, read_drives
 
@@ -30,6 +31,8 @@ SIZE_SELECTION = "easy_to_hard"
 """The cars whose median the constant row answers."""
 CUT_OVERLAP = 0.5
 """The overlap of the rates by score that `evaluate_folders` reports."""
+PRECISION_TITLE = "KITTI average precision (R40) of its ceiling on these sweeps"
+VEHICLES_TITLE = f"the same of cars, vans, trucks and trams as one class, at IoU {VEHICLE_OVERLAP:g}"
 METRIC_NAMES = {"image": "2D box", "orientation": "orientation", "bev": "bird's-eye view", "3d": "3D"}
 
 
@@ -99,7 +102,8 @@ def print_report(report: Mapping[str, Any], console: Console) -> None:
     console.print(bin_table("LiDAR points", everything["by_points"]))
     console.print(size_table(report["selections"][SIZE_SELECTION]["matched"]))
     console.print(pose_table(report["selections"]))
-    console.print(precision_table(report["kitti"]["curves"]))
+    console.print(precision_table(report["kitti"]["curves"], PRECISION_TITLE))
+    console.print(precision_table(report["vehicles"], VEHICLES_TITLE))
     if report["kitti"]["by_drive"]:
         console.print(drive_table(report["kitti"]["by_drive"]))
 
@@ -185,7 +189,7 @@ def _size_row(name: str, errors: Mapping[str, Any]) -> list[str]:
     return [name, *(_number(errors[key], digits) for key, digits in keys)]
 
 
-def precision_table(curves: Iterable[Mapping[str, Any]]) -> Table:
+def precision_table(curves: Iterable[Mapping[str, Any]], title: str) -> Table:
     """KITTI's average precision over 40 recalls, and the most that perfect boxes reach on these sweeps."""
     grouped: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
     for curve in curves:
@@ -195,9 +199,7 @@ def precision_table(curves: Iterable[Mapping[str, Any]]) -> Table:
         cells = [f"{curve['r40']:.2f} of {curve['ceiling_r40']:.2f}" for curve in levels.values()]
         rows.append([f"{class_name}, {METRIC_NAMES.get(metric, metric)}", *cells])
     difficulties = list(next(iter(grouped.values()))) if grouped else []
-    return make_table(
-        "KITTI average precision (R40) of its ceiling on these sweeps", ["", *difficulties], rows
-    )
+    return make_table(title, ["", *difficulties], rows)
 
 
 def drive_table(by_drive: Mapping[str, Iterable[Mapping[str, Any]]]) -> Table:

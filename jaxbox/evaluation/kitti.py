@@ -27,6 +27,7 @@ import numpy as np
 from jaxbox.evaluation.boxes import camera_boxes, excused_from_above, image_boxes
 from jaxbox.evaluation.iou import framewise_overlaps, image_fractions, image_iou
 from jaxbox.io import KittiObject
+from jaxbox.types import Label
 
 DIFFICULTIES = ("easy", "moderate", "hard")
 MIN_HEIGHT_PX = (40, 25, 25)
@@ -37,6 +38,12 @@ MAX_TRUNCATION = (0.15, 0.3, 0.5)
 MIN_OVERLAP: Mapping[str, float] = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}
 """The overlap that a match must exceed, for every metric, from the development kit."""
 
+VEHICLE = "Vehicle"
+"""The one class of `as_vehicles`."""
+VEHICLE_TYPES = frozenset({"car", "van", "truck", "tram"} | {label.word for label in Label})
+VEHICLE_OVERLAP = 0.5
+"""What a match of vehicles must exceed: half a truck is out of sight, and nothing tells how long it is."""
+
 METRICS = ("image", "orientation", "bev", "3d")
 SOFT_OVERLAPS = (0.60, 0.65, 0.70, 0.75)
 """Overlaps that `soft_score` averages over: one borderline car weighs less than at .7 alone."""
@@ -44,7 +51,8 @@ SOFT_OVERLAPS = (0.60, 0.65, 0.70, 0.75)
 NUM_SAMPLES = 41
 _R11_STEP = 4
 _INVALID_ALPHA = -10
-_NEIGHBOURS = {"car": "van", "pedestrian": "person_sitting"}
+_NEIGHBOURS = {"car": "van", "pedestrian": "person_sitting", VEHICLE.lower(): "misc"}
+"""Trailers are labelled Misc."""
 
 # Roles of labels and detections for one class and difficulty.
 _COUNTS, _IGNORED, _OTHER = 0, 1, -1
@@ -188,6 +196,24 @@ def _by_drive(
             raise ValueError(f"frame {name} has no drive; add it to drives.")
         groups.setdefault(drives[name], []).append(frame)
     return groups
+
+
+def as_vehicles(objects: Objects) -> dict[str, list[KittiObject]]:
+    """The same objects, with cars, vans, trucks and trams as one class.
+
+    A van that is found as a car counts as found so; KITTI's own classes take it for neither right nor wrong.
+
+    Args:
+      objects: labels or detections of each frame, by name.
+
+    Returns:
+      The same frames and objects, vehicles with the type `VEHICLE`.
+    """
+
+    def rename(item: KittiObject) -> KittiObject:
+        return dataclasses.replace(item, type=VEHICLE) if item.type.lower() in VEHICLE_TYPES else item
+
+    return {name: [rename(item) for item in items] for name, items in objects.items()}
 
 
 def soft_score(labels: Objects, results: Objects, *, class_name: str = "Car") -> float:

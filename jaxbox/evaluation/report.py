@@ -211,6 +211,7 @@ def evaluate_objects(
       Numbers, strings, lists, dicts and None only:
         "num_frames", "num_drives" (None if unknown);
         "kitti": `KittiEvaluation.to_dict` of cars and of the other classes that have detections;
+        "vehicles": the curves of cars, vans, trucks and trams as one class, see `kitti.as_vehicles`;
         "soft": `kitti.soft_score` of cars;
         "selections": for each, see `measure_selection`.
 
@@ -225,6 +226,7 @@ def evaluate_objects(
         "num_frames": len(labels),
         "num_drives": None if drives is None else len({drives[name] for name in labels}),
         "kitti": protocol.to_dict(),
+        "vehicles": _vehicle_curves(labels, results),
         "soft": kitti.soft_score(labels, results),
         "selections": {
             name: measure_selection(
@@ -233,6 +235,13 @@ def evaluate_objects(
             for name, selection in usable.items()
         },
     }
+
+
+def _vehicle_curves(labels: kitti.Objects, results: kitti.Objects) -> list[dict[str, Any]]:
+    merged = kitti.as_vehicles(labels), kitti.as_vehicles(results)
+    overlap = {kitti.VEHICLE: kitti.VEHICLE_OVERLAP}
+    curves = kitti.evaluate(*merged, min_overlap=overlap, metrics=("bev", "3d")).curves
+    return [curve.to_dict() for curve in curves]
 
 
 def measure_selection(

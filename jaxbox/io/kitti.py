@@ -33,7 +33,7 @@ DONT_CARE = "DontCare"
 VEHICLE_TYPES = tuple(label.word.capitalize() for label in Label)
 """Types of the objects that the detector looks for."""
 
-MIN_VISIBLE_FRACTION = 0.3
+MIN_VISIBLE_FRACTION = 0.1
 """Boxes with less of their 2D box in the image are not answers: the labels hold what the image shows."""
 
 # Boxes are projected in chunks of this size, the last one padded, so that one shape is compiled.
