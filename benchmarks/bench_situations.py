@@ -3,10 +3,10 @@
     python -m benchmarks.bench_situations --json benchmarks/results/situations.json
     python -m benchmarks.bench_situations --only "under a ceiling"
 
-Each situation of `jaxbox.synthetic.situations` is one sweep or a few, with exact truth. Vehicles of 30 points or
-more count. One is *found* where a box from `jaxbox.DEFAULT_SCORE_THRESHOLD` on covers it with a bird's-eye view
-IoU of .5 or more, whatever its class; missed *loudly* where the status has a bit, and *silently* where it has
-none. *False* boxes cover none.
+Each situation of `jaxbox.synthetic.situations` is one sweep or a few, with exact truth. Vehicles of 30
+points or more count. One is *found* where a box from `jaxbox.DEFAULT_SCORE_THRESHOLD` on covers it with a
+bird's-eye view IoU of .5 or more, whatever its class; missed *loudly* where the status has a bit, and
+*silently* where it has none. *False* boxes cover none.
 """
 
 import collections

@@ -329,7 +329,10 @@ class VehicleConfig:
     ring_weight: Scalar = 8.0
     """score x exp(-weight x ring points / points)."""
     overhead_weight: Scalar = 6.0
-    """score x exp(-weight x points above / points)."""
+    """score x exp(-weight x points above / points), where those above are connected to the vehicle."""
+    overhead_gap_m: Scalar = 0.25
+    """They are connected where the gap between its top and the height from which points are above is at most
+    this, and are not where it is twice this: a ceiling or a crown is no part of what stands under it."""
     upper_height_m: Scalar = 0.9
     """Points higher than this are glass, bonnet and roof; see ``ClassPrior.recess_m``."""
     recess_share: Scalar = 0.4

@@ -299,7 +299,8 @@ def neighbourhood_score(
       rho: m, range of the box: it may be higher than its top by `top_grade` times this.
       prior: of the class.
       config: exp(-(ring weight x ring + overhead weight x above) / inside), and a factor from
-        `upright_score`, where no upper point is recessed, to 1 from the share `recess_share` on.
+        `upright_score`, where no upper point is recessed, to 1 from the share `recess_share` on. Points above
+        do not count where the top is twice `overhead_gap_m` below `count_max_height_m`.
 
     Returns:
       In [0, 1]; 0 where a gate of the class closes.
@@ -309,7 +310,9 @@ def neighbourhood_score(
         return 0.0
     height = min(max(prior.height_m, around.top), highest)
     score = asymmetric_gaussian(height, prior.height_m, prior.height_below_m, prior.height_above_m)
-    clutter = config.ring_weight * around.num_ring + config.overhead_weight * around.num_above
+    gap = prior.count_max_height_m - highest
+    connected = np.interp(gap, [config.overhead_gap_m, 2 * config.overhead_gap_m], [1.0, 0.0])
+    clutter = config.ring_weight * around.num_ring + config.overhead_weight * connected * around.num_above
     score *= np.exp(-clutter / max(around.num_inside, 1))
     share = around.num_recessed + PSEUDO_COUNT * config.recess_share
     share = share / (around.num_upper + PSEUDO_COUNT)

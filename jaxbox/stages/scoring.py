@@ -431,7 +431,8 @@ def neighbourhood_score(
       rho: (P,) float32, m, range of the box.
       prior: fields of (P,) float32.
       config: exp(-(ring weight x ring + overhead weight x above) / inside), and what upright boxes lose:
-        those with few upper points come near to the full score.
+        those with few upper points come near to the full score. Points above count as far as they are
+        connected: from a gap of `overhead_gap_m` on less and less, from twice that on not at all.
 
     Returns:
       (P,) float32 in [0, 1]; 0 where a gate fails.
@@ -439,9 +440,10 @@ def neighbourhood_score(
     highest = around.top + config.top_grade * rho
     plausible = (highest > prior.min_height_m) & (around.top < prior.max_height_m)
     top = jnp.clip(prior.height_m, around.top, highest)
-    clutter = (config.ring_weight * around.num_ring + config.overhead_weight * around.num_above) / (
-        jnp.maximum(around.num_inside, 1)
-    )
+    clearance = prior.count_max_height_m - highest
+    connected = jnp.clip(2 - clearance / config.overhead_gap_m, 0, 1)
+    overhead = config.overhead_weight * connected * around.num_above
+    clutter = (config.ring_weight * around.num_ring + overhead) / jnp.maximum(around.num_inside, 1)
     score = asymmetric_gaussian(top, prior.height_m, prior.height_below_m, prior.height_above_m)
     score = score * jnp.exp(-clutter)
     recessed = around.num_recessed + PSEUDO_COUNT * config.recess_share

@@ -1,7 +1,7 @@
 """Situations that are hard for a detector, one deterministic sweep each, with exact truth.
 
-`SITUATIONS` is the table: a name, the group that it belongs to, what stands where, and the sensor. The detector
-is told the points alone; `benchmarks.bench_situations` counts what it finds.
+`SITUATIONS` is the table: a name, the group that it belongs to, what stands where, and the sensor. The
+detector is told the points alone; `benchmarks.bench_situations` counts what it finds.
 """
 
 import dataclasses
