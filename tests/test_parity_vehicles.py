@@ -22,10 +22,11 @@ NUM_RANDOM = 300
 
 
 @parity.PerForm
-def count_points_around(boxes, tops, recess, num_boxes, xy, height, num_points):
+def count_points_around(boxes, tops, recess, sure, num_boxes, xy, height, num_points):
     prior = dataclasses.replace(SETTINGS.classes[0], count_max_height_m=tops, recess_m=recess)
     obstacles = Obstacles(jnp.arange(len(xy)), xy, height, jnp.int32(num_points), len(xy))
-    return scoring.count_points_around(boxes, prior, num_boxes, obstacles, SETTINGS, parity.CONFIG.region)
+    region = parity.CONFIG.region
+    return scoring.count_points_around(boxes, prior, sure, num_boxes, obstacles, SETTINGS, region)
 
 
 non_max_suppression = parity.PerForm(scoring.non_max_suppression)
@@ -43,7 +44,7 @@ def boxes_of(case, rng):
 
 @functools.cache
 def counted_by_reference(cases):
-    """Of each case: boxes, the heights of their classes, how far behind faces is recessed, and the counts."""
+    """Of each case: boxes, their classes' heights, how far behind is recessed, how sure they are, counts."""
     rng = np.random.default_rng(0)
     car = SETTINGS.classes[0]
     class_tops = [vehicle.count_max_height_m for vehicle in SETTINGS.classes]
@@ -52,27 +53,30 @@ def counted_by_reference(cases):
         boxes = boxes_of(case, rng)
         tops = rng.choice(class_tops, len(boxes)).astype(np.float32)
         recess = rng.choice([-1, 0.15, 0.3], len(boxes)).astype(np.float32)
+        sure = rng.choice([0, 0.5, 1], len(boxes)).astype(np.float32)
         counts = [
             reference.count_points_around(
                 box,
                 dataclasses.replace(car, count_max_height_m=float(top), recess_m=float(recess_m)),
                 case.obstacles,
                 SETTINGS,
+                sure=float(is_sure),
             )
-            for box, top, recess_m in zip(boxes.astype(float), tops, recess, strict=True)
+            for box, top, recess_m, is_sure in zip(boxes.astype(float), tops, recess, sure, strict=True)
         ]
-        rows.append((case, boxes, tops, recess, counts))
+        rows.append((case, boxes, tops, recess, sure, counts))
     return rows
 
 
 @pytest.mark.usefixtures("platform")
 def test_points_round_boxes_are_those_of_the_reference(cases):
-    for case, boxes, tops, recess, counted in counted_by_reference(cases):
+    for case, boxes, tops, recess, sure, counted in counted_by_reference(cases):
         xy, height = case.obstacles.xyz[:, :2].astype(np.float32), case.obstacles.height.astype(np.float32)
         around = count_points_around(
             parity.pad(boxes, MAX_BOXES),
             parity.pad(tops, MAX_BOXES),
             parity.pad(recess, MAX_BOXES),
+            parity.pad(sure, MAX_BOXES),
             len(boxes),
             parity.pad(xy, parity.MAX_OBSTACLES),
             parity.pad(height, parity.MAX_OBSTACLES),
@@ -231,8 +235,8 @@ def test_points_round_crowded_boxes_are_the_same_in_both_forms(num_boxes, num_po
     boxes = rng.uniform([-3, -3, 1, 1, -4], [3, 3, 12, 3, 4], (200, 5)).astype(np.float32)
     xy, height = rng.uniform(-5, 5, (20000, 2)), rng.uniform(0, 3, 20000)
     tops, recess = np.float32(rng.choice([2.2, 4], 200)), np.float32(rng.choice([-1, 0.3], 200))
-    points = np.float32(xy), np.float32(height), num_points
-    cpu, other = parity.in_both_forms(count_points_around, boxes, tops, recess, num_boxes, *points)
+    sure, points = np.float32(rng.uniform(size=200)), (np.float32(xy), np.float32(height), num_points)
+    cpu, other = parity.in_both_forms(count_points_around, boxes, tops, recess, sure, num_boxes, *points)
     rows, others = cpu.rows[:num_boxes], other.rows[:num_boxes]
     whole = [0, 2, 3, 4, 5]
     np.testing.assert_array_equal(rows[:, whole], others[:, whole])

@@ -665,6 +665,29 @@ def test_points_round_a_box_are_shared_out_by_margin_ring_and_height():
     assert (around.num_inside, around.top, around.num_above, around.num_ring) == (2, 1.4, 2, 2)
 
 
+def test_what_is_behind_a_box_counts_the_less_the_surer_the_box_is():
+    # The sensor sees the right side and the rear; points lie behind the left side and the front, and along
+    # the right side.
+    box = np.array([10.0, 5.0, 4.0, 2.0, 0.0])
+    left, front, along, before = [9.0, 6.3, 0], [12.3, 5.5, 0], [12.3, 4.2, 0], [9.0, 3.7, 0]
+    on_the_face = [9.0, 5.95, 0]
+    obstacles = obstacles_of(np.array([left, front, along, before, on_the_face]), np.full(5, 1.0))
+
+    def counts(sure):
+        around = reference.count_points_around(box, LOW_CAR, obstacles, AROUND, sure=sure)
+        return around.num_inside, around.num_ring
+
+    assert counts(0.0) == (1, 4)
+    assert counts(0.5) == (1, 2)
+    assert counts(1.0) == (0, 2)
+    xy = np.array([left, front, along, before])[:, :2]
+    assert reference.is_behind(xy, box, 0.29).tolist() == [True, True, False, False]
+    assert reference.is_behind(xy, box, 0.31).tolist() == [False, False, False, False]
+    # From the middle of the side neither end is hidden.
+    aside = np.array([0.0, 5.0, 4.0, 2.0, 0.0])
+    assert reference.is_behind(np.array([[2.3, 5.5], [0.0, 6.3]]), aside, 0.1).tolist() == [False, True]
+
+
 def test_depth_is_behind_the_nearest_visible_face_and_endless_round_the_sensor():
     box = np.array([10.0, 0.0, 4.0, 2.0, 0.0])
     rear_only = reference.depth_behind_faces(np.array([[8.0, 0.0], [8.5, 0.9], [7.9, 0.0]]), box)
@@ -732,8 +755,13 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     assert score(support=4.5) == pytest.approx(0.5)
     assert score(objective=2.4) == pytest.approx(0.5)
     assert score(around=dataclasses.replace(around, num_ring=25)) == pytest.approx(np.exp(-2))
-    assert score(around=dataclasses.replace(around, num_above=50)) == pytest.approx(np.exp(-3))
     assert score(around=dataclasses.replace(around, top=2.1)) == pytest.approx(np.exp(-1))
+    # What is above counts as far as it is connected: from a gap of .25 m to one of .5 m below 2.2 m.
+    overhead = [score(around=dataclasses.replace(around, num_above=n, top=2.1)) for n in (0, 50)]
+    assert overhead[1] / overhead[0] == pytest.approx(np.exp(-3))
+    halfway = [score(around=dataclasses.replace(around, num_above=n, top=1.75)) for n in (0, 50)]
+    assert halfway[1] / halfway[0] == pytest.approx(np.exp(-1.5))
+    assert score(around=dataclasses.replace(around, num_above=50)) == 1
     assert score(around=dataclasses.replace(around, num_upper=50, num_recessed=20)) == 1
     assert score(around=dataclasses.replace(around, num_upper=50, num_recessed=10)) == pytest.approx(
         0.2 + 0.8 * 12 / 55 / 0.4

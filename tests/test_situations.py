@@ -19,7 +19,13 @@ from jaxbox.synthetic.solids import Solid
 
 RESULTS = pathlib.Path(__file__).parents[1] / "benchmarks" / "results"
 BY_TITLE = {situation.title: situation for situation in SITUATIONS}
-IN_SHORT = {"open street: as it is": 10, "under a ceiling: 2.3 m": 6, "under a ceiling: 3 m": 6}
+IN_SHORT = {
+    "open street: as it is": 10,
+    "beside a wall: 0.2 m": 6,
+    "beside a hedge: 0.2 m": 6,
+    "under a ceiling: 2.3 m": 6,
+    "under a ceiling: 3 m": 6,
+}
 """Situations that the suite runs, and how many vehicles are to be found in each."""
 
 

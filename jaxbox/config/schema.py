@@ -311,7 +311,8 @@ class VehicleConfig:
     margin_m: Scalar = 0.1
     """A point this far outside a box still counts as inside."""
     ring_m: Scalar = 0.5
-    """A point farther outside than the margin but nearer than this speaks against the box."""
+    """A point farther outside than the margin but nearer than this speaks against the box, unless it is
+    behind a face that the sensor does not see, and so of another thing."""
     top_quantile: Scalar = 0.01
     """Share of the points in a box that may lie above its top: a single return in the air is not a roof."""
     top_margin_m: Scalar = 0.03
