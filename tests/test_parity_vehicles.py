@@ -22,11 +22,12 @@ NUM_RANDOM = 300
 
 
 @parity.PerForm
-def count_points_around(boxes, tops, recess, past_ends, num_boxes, xy, height, num_points):
+def count_points_around(boxes, tops, recess, past_ends, sure, num_boxes, xy, height, num_points):
     fields = {"count_max_height_m": tops, "recess_m": recess, "past_ends_m": past_ends}
     prior = dataclasses.replace(SETTINGS.classes[0], **fields)
     obstacles = Obstacles(jnp.arange(len(xy)), xy, height, jnp.int32(num_points), len(xy))
-    return scoring.count_points_around(boxes, prior, num_boxes, obstacles, SETTINGS, parity.CONFIG.region)
+    region = parity.CONFIG.region
+    return scoring.count_points_around(boxes, prior, sure, num_boxes, obstacles, SETTINGS, region)
 
 
 non_max_suppression = parity.PerForm(scoring.non_max_suppression)
@@ -44,7 +45,7 @@ def boxes_of(case, rng):
 
 @functools.cache
 def counted_by_reference(cases):
-    """Of each case: boxes, what of their priors `count_points_around` takes, and the counts."""
+    """Of each case: boxes, what else of them `count_points_around` takes, and the counts."""
     rng = np.random.default_rng(0)
     car = SETTINGS.classes[0]
     class_tops = [vehicle.count_max_height_m for vehicle in SETTINGS.classes]
@@ -54,15 +55,16 @@ def counted_by_reference(cases):
         tops = rng.choice(class_tops, len(boxes)).astype(np.float32)
         recess = rng.choice([-1, 0.15, 0.3], len(boxes)).astype(np.float32)
         past_ends = rng.choice([0, 2], len(boxes)).astype(np.float32)
+        sure = rng.choice([0, 0.5, 1], len(boxes)).astype(np.float32)
         of_boxes = [
             dataclasses.replace(car, count_max_height_m=top, recess_m=recess_m, past_ends_m=past)
             for top, recess_m, past in zip(tops.tolist(), recess.tolist(), past_ends.tolist(), strict=True)
         ]
         counts = [
-            reference.count_points_around(box, prior, case.obstacles, SETTINGS)
-            for box, prior in zip(boxes.astype(float), of_boxes, strict=True)
+            reference.count_points_around(box, prior, case.obstacles, SETTINGS, sure=is_sure)
+            for box, prior, is_sure in zip(boxes.astype(float), of_boxes, sure.tolist(), strict=True)
         ]
-        rows.append((case, boxes, (tops, recess, past_ends), counts))
+        rows.append((case, boxes, (tops, recess, past_ends, sure), counts))
     return rows
 
 
@@ -230,7 +232,9 @@ def test_points_round_crowded_boxes_are_the_same_in_both_forms(num_boxes, num_po
     rng = np.random.default_rng(num_boxes)
     boxes = rng.uniform([-3, -3, 1, 1, -4], [3, 3, 12, 3, 4], (200, 5)).astype(np.float32)
     xy, height = rng.uniform(-5, 5, (20000, 2)), rng.uniform(0, 3, 20000)
-    priors = [np.float32(rng.choice(of_class, 200)) for of_class in ([2.2, 4], [-1, 0.3], [0, 2])]
+    priors = [
+        np.float32(rng.choice(of_class, 200)) for of_class in ([2.2, 4], [-1, 0.3], [0, 2], [0, 0.5, 1])
+    ]
     points = np.float32(xy), np.float32(height), num_points
     cpu, other = parity.in_both_forms(count_points_around, boxes, *priors, num_boxes, *points)
     rows, others = cpu.rows[:num_boxes], other.rows[:num_boxes]

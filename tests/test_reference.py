@@ -683,12 +683,36 @@ def test_points_round_a_box_are_shared_out_by_margin_ring_and_height():
 
 
 def test_the_ring_of_a_long_vehicle_reaches_farther_past_its_ends_but_not_its_sides():
-    box = np.array([10.0, 0.0, 8.0, 2.0, 0.0])
-    xyz = np.array([[10, 0, 0], [16.4, 0.5, 0], [3.6, -1.4, 0], [16.6, 0, 0], [10, 1.6, 0]])
+    # From the middle of the side neither end is hidden.
+    box = np.array([0.0, 10.0, 8.0, 2.0, 0.0])
+    xyz = np.array([[0, 10, 0], [6.4, 10.5, 0], [-6.4, 8.6, 0], [6.6, 10, 0], [0, 8.4, 0.0]])
     for past_ends_m, num_ring in ((0, 0), (2, 2)):
         prior = dataclasses.replace(LOW_CAR, past_ends_m=past_ends_m)
         around = reference.count_points_around(box, prior, obstacles_of(xyz, np.ones(5)), AROUND)
         assert (around.num_inside, around.num_ring) == (1, num_ring)
+
+
+def test_what_is_behind_a_box_counts_the_less_the_surer_the_box_is():
+    # The sensor sees the right side and the rear; points lie behind the left side and the front, and along
+    # the right side.
+    box = np.array([10.0, 5.0, 4.0, 2.0, 0.0])
+    left, front, along, before = [9.0, 6.3, 0], [12.3, 5.5, 0], [12.3, 4.2, 0], [9.0, 3.7, 0]
+    on_the_face = [9.0, 5.95, 0]
+    obstacles = obstacles_of(np.array([left, front, along, before, on_the_face]), np.full(5, 1.0))
+
+    def counts(sure):
+        around = reference.count_points_around(box, LOW_CAR, obstacles, AROUND, sure=sure)
+        return around.num_inside, around.num_ring
+
+    assert counts(0.0) == (1, 4)
+    assert counts(0.5) == (1, 2)
+    assert counts(1.0) == (0, 2)
+    xy = np.array([left, front, along, before])[:, :2]
+    assert reference.is_behind(xy, box, 0.29).tolist() == [True, True, False, False]
+    assert reference.is_behind(xy, box, 0.31).tolist() == [False, False, False, False]
+    # From the middle of the side neither end is hidden.
+    aside = np.array([0.0, 5.0, 4.0, 2.0, 0.0])
+    assert reference.is_behind(np.array([[2.3, 5.5], [0.0, 6.3]]), aside, 0.1).tolist() == [False, True]
 
 
 def test_depth_is_behind_the_nearest_visible_face_and_endless_round_the_sensor():
@@ -750,7 +774,7 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     assert score(support=None) == 1
     assert score(moved(PERFECT_BOX, length=-0.8)) == pytest.approx(np.exp(-1))
     assert score(moved(PERFECT_BOX, length=2.0)) == pytest.approx(np.exp(-1))
-    assert score(moved(PERFECT_BOX, width=0.3)) == pytest.approx(np.exp(-1))
+    assert score(moved(PERFECT_BOX, width=0.4)) == pytest.approx(np.exp(-1))
     assert score(num_points=50) == pytest.approx(0.5**0.3)
     assert score(hit=0.25) == 0.25
     assert score(prior=dataclasses.replace(CAR, prior_weight=0.5)) == 0.5
@@ -758,8 +782,13 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     assert score(support=4.5) == pytest.approx(0.5)
     assert score(objective=2.4) == pytest.approx(0.5)
     assert score(around=dataclasses.replace(around, num_ring=25)) == pytest.approx(np.exp(-2))
-    assert score(around=dataclasses.replace(around, num_above=50)) == pytest.approx(np.exp(-3))
     assert score(around=dataclasses.replace(around, top=2.1)) == pytest.approx(np.exp(-1))
+    # What is above counts as far as it is connected: from a gap of .25 m to one of .5 m below 2.2 m.
+    overhead = [score(around=dataclasses.replace(around, num_above=n, top=2.1)) for n in (0, 50)]
+    assert overhead[1] / overhead[0] == pytest.approx(np.exp(-3))
+    halfway = [score(around=dataclasses.replace(around, num_above=n, top=1.75)) for n in (0, 50)]
+    assert halfway[1] / halfway[0] == pytest.approx(np.exp(-1.5))
+    assert score(around=dataclasses.replace(around, num_above=50)) == 1
     assert score(around=dataclasses.replace(around, num_upper=50, num_recessed=20)) == 1
     assert score(around=dataclasses.replace(around, num_upper=50, num_recessed=10)) == pytest.approx(
         0.2 + 0.8 * 12 / 55 / 0.4

@@ -339,6 +339,22 @@ def mounting() -> str:
     return table(header, lines) + made_with(load("mounting"))
 
 
+def situations() -> str:
+    """What is found in hard situations: before the rules that they led to, and now."""
+    now, before = load("situations"), load("situations_before")
+    was = {(row["group"], row["situation"]): row["found"] for row in before["rows"]}
+    names = ("vehicles", "found", "loud", "silent", "false")
+    rows = [
+        (
+            f"{row['group']}: {row['situation']}",
+            was.get((row["group"], row["situation"]), ""),
+            *(row[n] for n in names),
+        )
+        for row in now["rows"]
+    ]
+    return table(["situation", "found before", *names], rows) + made_with(now)
+
+
 def status() -> str:
     """Every bit and its sentence."""
     return table_of_bits(Status)
@@ -657,6 +673,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "beams": beams,
     "beams_synthetic": beams_synthetic,
     "mounting": mounting,
+    "situations": situations,
     "status": status,
     "counts": counts,
     "track_status": track_status,

@@ -62,7 +62,7 @@ _POSITIVE = """
     vehicles.classes.max_height_m vehicles.classes.max_length_m vehicles.classes.max_width_m
     vehicles.classes.count_max_height_m
     vehicles.saturation_points vehicles.support_points vehicles.recess_share
-    vehicles.free_scale vehicles.objective_softness
+    vehicles.free_scale vehicles.objective_softness vehicles.overhead_gap_m
     gate acceleration_mps2 position_sd_m birth_speed_sd_mps max_gap_s max_ego_speed_mps
 """
 """Divisors, and what leaves nothing to find at zero. Zero for a map's greatest height turns the map off."""

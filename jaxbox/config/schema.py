@@ -311,8 +311,9 @@ class VehicleConfig:
     margin_m: Scalar = 0.1
     """A point this far outside a box still counts as inside."""
     ring_m: Scalar = 0.5
-    """A point farther outside than the margin but nearer than this speaks against the box; past the ends of
-    long vehicles also one that is ``ClassPrior.past_ends_m`` farther."""
+    """A point farther outside than the margin but nearer than this speaks against the box, unless it is
+    behind a face that the sensor does not see, and so of another thing; past the ends of long vehicles also
+    one that is ``ClassPrior.past_ends_m`` farther."""
     top_quantile: Scalar = 0.01
     """Share of the points in a box that may lie above its top: a single return in the air is not a roof."""
     top_margin_m: Scalar = 0.03
@@ -330,7 +331,10 @@ class VehicleConfig:
     ring_weight: Scalar = 8.0
     """score x exp(-weight x ring points / points)."""
     overhead_weight: Scalar = 6.0
-    """score x exp(-weight x points above / points)."""
+    """score x exp(-weight x points above / points), where those above are connected to the vehicle."""
+    overhead_gap_m: Scalar = 0.25
+    """They are connected where the gap between its top and the height from which points are above is at most
+    this, and are not where it is twice this: a ceiling or a crown is no part of what stands under it."""
     upper_height_m: Scalar = 0.9
     """Points higher than this are glass, bonnet and roof; see ``ClassPrior.recess_m``."""
     recess_share: Scalar = 0.4

@@ -23,6 +23,8 @@ PSEUDO_COUNT = 5
 """Pseudo-count: upper points that are added, with the share of the full score behind the faces."""
 NUM_LEVELS = 20
 """Levels of height by which the top is found."""
+SIDE_DEPTHS_M = -0.15, 0.35
+"""Points at these depths behind the long side that the sensor sees lie along it."""
 LOWEST_LEVEL = 0.4
 """Where the levels begin, as a share of the highest that points of the vehicle may have."""
 
@@ -49,20 +51,21 @@ def score_boxes(
 
     def judge(row: int, hypothesis: ClassHypothesis, box: CompletedBox) -> Candidate:
         cluster, prior = clusters[hypothesis.cluster], config.vehicles.classes[hypothesis.label]
-        around = _look_around(box.box, prior, cluster, obstacles, config.vehicles)
         hit, free_length, support = 1.0, 0.0, None
         if rays is not None:
             hit, free_length, support = (float(a[row]) for a in (rays[0].hit, rays[0].free_length, rays[1]))
-        score = score_box(
+        early = early_score(
             box,
             prior,
-            around=around,
             num_points=len(cluster.members),
             hit=hit,
             free_length=free_length,
             support=support,
             config=config.vehicles,
         )
+        around = _look_around(box.box, prior, cluster, early, obstacles, config.vehicles)
+        rho = float(np.hypot(box.box[0], box.box[1]))
+        score = early * neighbourhood_score(around, rho, prior, config.vehicles)
         return Candidate(hypothesis, box, around, score)
 
     pairs = zip(completed.hypotheses, completed.boxes, strict=True)
@@ -72,11 +75,17 @@ def score_boxes(
 
 
 def _look_around(
-    box: np.ndarray, prior: ClassPrior, cluster: Cluster, obstacles: Obstacles, config: VehicleConfig
+    box: np.ndarray,
+    prior: ClassPrior,
+    cluster: Cluster,
+    early: float,
+    obstacles: Obstacles,
+    config: VehicleConfig,
 ) -> NeighbourhoodCounts:
     if not config.neighbourhood:
         return cluster_alone(len(cluster.members), cluster.top_m)
-    return count_points_around(box, prior, obstacles, config)
+    sure = early * min(len(cluster.members) / float(config.saturation_points), 1.0) ** 2
+    return count_points_around(box, prior, obstacles, config, sure=sure)
 
 
 def keep_best(candidates: Sequence[Candidate], config: VehicleConfig) -> Kept:
@@ -114,7 +123,7 @@ def distance_outside(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
 
 
 def count_points_around(
-    box: np.ndarray, prior: ClassPrior, obstacles: Obstacles, config: VehicleConfig
+    box: np.ndarray, prior: ClassPrior, obstacles: Obstacles, config: VehicleConfig, *, sure: float = 0.0
 ) -> NeighbourhoodCounts:
     """Counts the points of the whole sweep in and round a box.
 
@@ -126,6 +135,8 @@ def count_points_around(
       obstacles: all points above the ground.
       config: a point less than the margin outside counts as inside, one farther but less than the ring is in
         the ring; which points are upper ones, and which share of those inside may lie above the top.
+      sure: in [0, 1], that the box ends where it does: points behind it are not counted, from the ring's end
+        on at 0, from the margin before the hidden face at 1.
 
     Returns:
       The counts.
@@ -136,6 +147,8 @@ def count_points_around(
     reach_m = np.hypot(longer[2], longer[3]) / 2 + 2 * config.ring_m
     near = obstacles.tree.query_ball_point(box[:2], reach_m)
     xy, height = obstacles.xyz[near, :2], obstacles.height[near]
+    counted = ~is_behind(xy, box, config.ring_m - (config.ring_m + config.margin_m) * sure)
+    xy, height = xy[counted], height[counted]
     outside = distance_outside(xy, box)
     within = outside < config.margin_m
     counted = height < prior.count_max_height_m
@@ -187,6 +200,31 @@ def top_of(height: np.ndarray, max_height_m: float, top_quantile: float) -> floa
     return float(height.max())
 
 
+def is_behind(xy: np.ndarray, box: np.ndarray, behind_m: Scalar) -> np.ndarray:
+    """Points beyond the faces that a sensor at the origin does not see, because the box hides them.
+
+    Args:
+      xy: (n, 2) m.
+      box: (5,): x, y, length, width in m and yaw in rad.
+      behind_m: how far beyond.
+
+    Returns:
+      (n,) bool; not those beyond the far end that go on along the long side that the sensor sees.
+
+    >>> is_behind(np.array([[12.4, 0.9], [7.6, 0.0]]), np.array([10.0, 0, 4, 2, 0]), 0.1).tolist()
+    [True, False]
+    """
+    x, y, length, width, yaw = box
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    local, sensor = (xy - [x, y]) @ turn, np.array([-x, -y]) @ turn
+    sees = np.abs(sensor) > [length / 2, width / 2]
+    toward = local * np.sign(sensor)
+    beyond = sees & (toward < [-length / 2 - behind_m, -width / 2 - behind_m])
+    depth = width / 2 - toward[:, 1]
+    goes_on = sees[1] & (depth > SIDE_DEPTHS_M[0]) & (depth < SIDE_DEPTHS_M[1])
+    return beyond[:, 1] | (beyond[:, 0] & ~goes_on)
+
+
 def depth_behind_faces(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
     """How far points lie behind the nearest face that a sensor at the origin sees; negative in front.
 
@@ -233,12 +271,34 @@ def score_box(
     Returns:
       The score; 0 where a gate of the class closes.
     """
+    early = early_score(
+        box,
+        prior,
+        num_points=num_points,
+        hit=hit,
+        free_length=free_length,
+        support=support,
+        config=config,
+    )
+    rho = float(np.hypot(box.box[0], box.box[1]))
+    return early * neighbourhood_score(around, rho, prior, config)
+
+
+def early_score(
+    box: CompletedBox,
+    prior: ClassPrior,
+    *,
+    num_points: int,
+    hit: float,
+    free_length: float,
+    support: float | None,
+    config: VehicleConfig,
+) -> float:
+    """The part of the score that needs no look at what surrounds the box; see `score_box`."""
     if max(box.measured_length_m, box.measured_width_m) < config.min_extent_m:
         return 0.0
-    rho = float(np.hypot(box.box[0], box.box[1]))
     score = evidence_score(num_points, hit, free_length, support, box.objective, config)
-    score *= size_score(box.box[2:4], prior) * neighbourhood_score(around, rho, prior, config)
-    return float(score * prior.prior_weight)
+    return float(score * size_score(box.box[2:4], prior) * prior.prior_weight)
 
 
 def asymmetric_gaussian(value: Scalar, peak: Scalar, below: Scalar, above: Scalar) -> float:
@@ -301,7 +361,8 @@ def neighbourhood_score(
       rho: m, range of the box: it may be higher than its top by `top_grade` times this.
       prior: of the class.
       config: exp(-(ring weight x ring + overhead weight x above) / inside), and a factor from
-        `upright_score`, where no upper point is recessed, to 1 from the share `recess_share` on.
+        `upright_score`, where no upper point is recessed, to 1 from the share `recess_share` on. Points above
+        do not count where the top is twice `overhead_gap_m` below `count_max_height_m`.
 
     Returns:
       In [0, 1]; 0 where a gate of the class closes.
@@ -311,7 +372,9 @@ def neighbourhood_score(
         return 0.0
     height = min(max(prior.height_m, around.top), highest)
     score = asymmetric_gaussian(height, prior.height_m, prior.height_below_m, prior.height_above_m)
-    clutter = config.ring_weight * around.num_ring + config.overhead_weight * around.num_above
+    gap = prior.count_max_height_m - highest
+    connected = min(max(2 - gap / config.overhead_gap_m, 0.0), 1.0)
+    clutter = config.ring_weight * around.num_ring + config.overhead_weight * connected * around.num_above
     score *= np.exp(-clutter / max(around.num_inside, 1))
     share = around.num_recessed + PSEUDO_COUNT * config.recess_share
     share = share / (around.num_upper + PSEUDO_COUNT)

@@ -55,6 +55,11 @@ PSEUDO_COUNT = 5
 that a few points cannot give an extreme share."""
 
 
+SIDE_DEPTH_M, SIDE_HALF_M = 0.1, 0.25
+"""Points beyond the far end whose depth behind the long side that the sensor sees is the first, give or take
+the second, go on along that side: they are of what the box holds a part of."""
+
+
 INSIDE_TOLERANCE_M = 1e-3
 """A point on the face of its box is inside."""
 
@@ -84,7 +89,7 @@ class NeighbourhoodCounts:
 
     @property
     def num_ring(self) -> jax.Array:
-        """(P,) points of vehicle height just outside."""
+        """(P,) points of vehicle height just outside, but for those behind the box."""
         return self.rows[:, 3]
 
     @property
@@ -135,8 +140,8 @@ def score_boxes(
         return rectangle, *of_hypothesis, take(score, chosen)
 
     picked = map_rows(pick, chosen, num_rows=num)
-    rectangle, label, cluster, _ = picked
-    around = _look_around(rectangle, label, cluster, num, clusters, obstacles, config)
+    rectangle, label, cluster, early = picked
+    around = _look_around(rectangle, label, cluster, early, num, clusters, obstacles, config)
 
     def finish(rows: tuple[Any, ...]) -> Candidates:
         candidates = _finish(rows, clusters, settings)
@@ -182,6 +187,7 @@ def _look_around(
     rectangle: jax.Array,
     label: jax.Array,
     cluster: jax.Array,
+    early: jax.Array,
     num: jax.Array,
     clusters: Clusters,
     obstacles: Obstacles,
@@ -191,8 +197,10 @@ def _look_around(
     if not config.vehicles.neighbourhood:
         num_points = take(clusters.num_points, cluster).astype(jnp.float32)
         return cluster_alone(num_points, take(clusters.high[:, 2], cluster))
-    prior = prior_of(config.vehicles.classes, label)
-    return count_points_around(rectangle, prior, num, obstacles, config.vehicles, config.region)
+    prior, num_points = prior_of(config.vehicles.classes, label), take(clusters.num_points, cluster)
+    dense = jnp.minimum(num_points.astype(jnp.float32) / config.vehicles.saturation_points, 1)
+    sure = early * dense**2
+    return count_points_around(rectangle, prior, sure, num, obstacles, config.vehicles, config.region)
 
 
 def _finish(rows: tuple[Any, ...], clusters: Clusters, config: VehicleConfig) -> Candidates:
@@ -245,6 +253,7 @@ def keep_best(candidates: Candidates, config: VehicleConfig) -> Kept:
 def count_points_around(
     boxes: jax.Array,
     prior: ClassPrior,
+    sure: jax.Array,
     num_boxes: jax.Array,
     obstacles: Obstacles,
     config: VehicleConfig,
@@ -257,6 +266,9 @@ def count_points_around(
       prior: fields of (P,) float32: points lower than `count_max_height_m` belong to the vehicle, and
         those farther than `recess_m` behind the faces that the sensor sees are recessed; the ring reaches
         `past_ends_m` farther past the ends.
+      sure: (P,) float32, in [0, 1]: how sure it is that the box ends where it does. Points beyond a face that
+        the sensor does not see are of another thing, and not counted: from the ring's end on where nothing is
+        sure, from the margin before the face where all is.
       num_boxes: () int32, rows that hold a box.
       obstacles: all points above the ground.
       config: margin, ring, and what upper points and strays are. A `top_quantile` of 0 makes the highest
@@ -300,8 +312,9 @@ def count_points_around(
         top = _top(highest, config.top_quantile * inside, counts[:, NUM_KINDS:], frames[:, -1])
         return jnp.stack([inside, top, above, ring, upper, recessed], axis=1)
 
-    priors = prior.count_max_height_m, prior.recess_m, prior.past_ends_m
-    rows = map_rows(prepare, (boxes, *priors), num_rows=num_boxes)
+    behind_m = ring_m - (ring_m + config.margin_m) * sure
+    columns = boxes, prior.count_max_height_m, prior.recess_m, prior.past_ends_m, behind_m
+    rows = map_rows(prepare, columns, num_rows=num_boxes)
     return NeighbourhoodCounts(map_rows(look, rows, num_rows=num_boxes, chunk=chunks.BOXES))
 
 
@@ -320,19 +333,26 @@ def cluster_alone(num_points: jax.Array, top: jax.Array) -> NeighbourhoodCounts:
 
 
 def _frames(
-    boxes: jax.Array, count_max_height_m: jax.Array, recess_m: jax.Array, past_ends_m: jax.Array
+    boxes: jax.Array,
+    count_max_height_m: jax.Array,
+    recess_m: jax.Array,
+    past_ends_m: jax.Array,
+    behind_m: jax.Array,
 ) -> jax.Array:
-    """(P, 12) the frames that points round a box are compared in, see `_judge`."""
+    """(P, 15) the frames that points round a box are compared in, see `_judge`."""
     x, y, length, width, yaw = boxes.T
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     half_l, half_w = length / 2, width / 2
     # The sensor at the origin, in the box's frame: it sees the faces on its side of the box.
     sensor_u, sensor_v = -(x * cos + y * sin), x * sin - y * cos
-    face_u = jnp.where(jnp.abs(sensor_u) > half_l, half_l - recess_m, jnp.inf)
-    face_v = jnp.where(jnp.abs(sensor_v) > half_w, half_w - recess_m, jnp.inf)
+    sides = (sensor_u, half_l), (sensor_v, half_w)
+    near = [jnp.where(jnp.abs(sensor) > half, half - recess_m, jnp.inf) for sensor, half in sides]
+    far = [jnp.where(jnp.abs(sensor) > half, -half - behind_m, -jnp.inf) for sensor, half in sides]
     facing = jnp.sign(sensor_u), jnp.sign(sensor_v)
+    side_v = jnp.where(jnp.abs(sensor_v) > half_w, half_w - SIDE_DEPTH_M, jnp.inf)
     half = half_l, half_w, half_l + past_ends_m
-    return jnp.stack([x, y, cos, sin, *half, *facing, face_u, face_v, count_max_height_m], axis=1)
+    columns = x, y, cos, sin, *half, *facing, *near, *far, side_v, count_max_height_m
+    return jnp.stack(columns, axis=1)
 
 
 def _count_runs(
@@ -365,18 +385,21 @@ def _judge(
     frames: jax.Array, valid: jax.Array, points: Sequence[jax.Array], config: VehicleConfig
 ) -> tuple[jax.Array, jax.Array]:
     """Counts of each kind and level of points in blocks (B, L) of them, and the highest inside (B,)."""
-    box_x, box_y, cos, sin, half_l, half_w, ring_half_l, facing_u, facing_v, face_u, face_v, max_height = (
-        frames[:, k, None] for k in range(frames.shape[1])
-    )
+    columns = [frames[:, k, None] for k in range(frames.shape[1])]
+    box_x, box_y, cos, sin, half_l, half_w, ring_half_l, facing_u, facing_v, *faces, max_height = columns
+    near_u, near_v, far_u, far_v, side_v = faces
     x, y, height = points
     dx, dy = x - box_x, y - box_y
     u, v = dx * cos + dy * sin, dy * cos - dx * sin
-    out_u, out_v = jnp.abs(u), jnp.where(valid, jnp.abs(v) - half_w, jnp.inf)
+    toward_u, toward_v = facing_u * u, facing_v * v
+    is_along = jnp.abs(toward_v - side_v) < SIDE_HALF_M
+    is_behind = (toward_v < far_v) | (toward_u < far_u) & ~is_along
+    out_u, out_v = jnp.abs(u), jnp.where(valid & ~is_behind, jnp.abs(v) - half_w, jnp.inf)
     inside, low = jnp.maximum(out_u - half_l, out_v) < config.margin_m, height < max_height
-    ring = ~inside & low & (jnp.maximum(out_u - ring_half_l, out_v) < config.ring_m)
     upper = inside & low & (height > config.upper_height_m)
-    recessed = upper & (jnp.minimum(face_u - facing_u * u, face_v - facing_v * v) > 0)
-    kinds = (inside & low, inside & ~low, ring, upper, recessed)
+    recessed = upper & (toward_u < near_u) & (toward_v < near_v)
+    ring = ~inside & low & (jnp.maximum(out_u - ring_half_l, out_v) < config.ring_m)
+    kinds = inside & low, inside & ~low, ring, upper, recessed
     share = height / max_height - LOWEST_LEVEL
     level = jnp.minimum(share * (NUM_LEVELS / (1 - LOWEST_LEVEL)), NUM_LEVELS - 1).astype(jnp.int32)
     level = jnp.where(inside & low & (share > 0), level, NUM_LEVELS)
@@ -437,7 +460,8 @@ def neighbourhood_score(
       rho: (P,) float32, m, range of the box.
       prior: fields of (P,) float32.
       config: exp(-(ring weight x ring + overhead weight x above) / inside), and what upright boxes lose:
-        those with few upper points come near to the full score.
+        those with few upper points come near to the full score. Points above count as far as they are
+        connected: from a gap of `overhead_gap_m` on less and less, from twice that on not at all.
 
     Returns:
       (P,) float32 in [0, 1]; 0 where a gate fails.
@@ -445,9 +469,10 @@ def neighbourhood_score(
     highest = around.top + config.top_grade * rho
     plausible = (highest > prior.min_height_m) & (around.top < prior.max_height_m)
     top = jnp.clip(prior.height_m, around.top, highest)
-    clutter = (config.ring_weight * around.num_ring + config.overhead_weight * around.num_above) / (
-        jnp.maximum(around.num_inside, 1)
-    )
+    clearance = prior.count_max_height_m - highest
+    connected = jnp.clip(2 - clearance / config.overhead_gap_m, 0, 1)
+    overhead = config.overhead_weight * connected * around.num_above
+    clutter = (config.ring_weight * around.num_ring + overhead) / jnp.maximum(around.num_inside, 1)
     score = asymmetric_gaussian(top, prior.height_m, prior.height_below_m, prior.height_above_m)
     score = score * jnp.exp(-clutter)
     recessed = around.num_recessed + PSEUDO_COUNT * config.recess_share

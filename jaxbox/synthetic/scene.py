@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from jaxbox.synthetic.solids import Foliage, Material, Shape, make_post, make_solid, vehicle_solids
+from jaxbox.synthetic.solids import Body, Foliage, Material, Shape, make_post, make_solid, vehicle_solids
 from jaxbox.synthetic.terrain import GroundKind, Road, Terrain, make_terrain
 from jaxbox.types import Label
 
@@ -71,6 +71,8 @@ class Vehicle:
     """m: length, width, height."""
     paint: tuple[float, float, float]
     """Linear RGB in [0, 1]."""
+    body: Body | None = None
+    """Its pieces; those of its class by default."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,7 +137,8 @@ def vehicle_pose(vehicle: Vehicle, terrain: Terrain) -> tuple[np.ndarray, np.nda
 def place_vehicle(vehicle: Vehicle, terrain: Terrain, object_id: int) -> Thing:
     """The vehicle's solids in the sensor frame."""
     linear, offset = vehicle_pose(vehicle, terrain)
-    solids = vehicle_solids(vehicle.label, vehicle.size)
+    body = vehicle.body
+    solids = vehicle_solids(vehicle.label, vehicle.size) if body is None else body(*vehicle.size)
     return Thing(object_id, tuple(s.placed(linear, offset) for s in solids), vehicle.paint)
 
 

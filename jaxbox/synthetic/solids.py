@@ -2,7 +2,7 @@
 
 import dataclasses
 import enum
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -228,6 +228,9 @@ def vehicle_solids(label: Label, size: Sequence[float]) -> list[Solid]:
     return {Label.CAR: _car, Label.VAN: _van}.get(label, _truck)(*size)
 
 
+Body = Callable[[float, float, float], list[Solid]]
+"""Makes the pieces of a vehicle from its length, width and height, m, as `vehicle_solids` does."""
+
 SEDAN_LENGTH_M = 4.2
 """Cars longer than this have a boot; shorter ones a steep tailgate."""
 
@@ -261,6 +264,49 @@ def _car(length: float, width: float, height: float) -> list[Solid]:
         cut_material=Material.GLASS,
     )
     return [lower, cabin, *_wheels((-0.31 * length, 0.31 * length), half, 0.31)]
+
+
+def suv_body(length: float, width: float, height: float) -> list[Solid]:
+    """A tall car with a long bonnet and an upright tailgate."""
+    belt, half, body = 0.6 * height, width / 2, width - 2 * TYRE_BULGE_M
+    screen, roof = 0.24 * length, 0.1 * length
+    lower = make_solid(
+        (-length / 2, -body / 2, 0.25),
+        (length / 2, body / 2, belt),
+        material=Material.PAINT,
+        cuts=[*_rounded_corners(length, body, 0.2), _slope(length / 2, 0.5 * height, screen, belt)],
+    )
+    cabin = make_solid(
+        (-length / 2, -half, belt),
+        (screen, half, height),
+        material=Material.PAINT,
+        cuts=[
+            _slope(screen, belt, roof, height),
+            _slope(-0.44 * length, height, -0.49 * length, belt),
+            *_leaning_sides(half - 0.05, belt, 12.0),
+        ],
+        cut_material=Material.GLASS,
+    )
+    return [lower, cabin, *_wheels((-0.3 * length, 0.31 * length), half, 0.37)]
+
+
+def pickup_body(length: float, width: float, height: float) -> list[Solid]:
+    """A car with a low bed behind its cabin."""
+    belt, half, body = 0.58 * height, width / 2, width - 2 * TYRE_BULGE_M
+    lower = make_solid(
+        (-length / 2, -body / 2, 0.3),
+        (length / 2, body / 2, belt),
+        material=Material.PAINT,
+        cuts=[*_rounded_corners(length, body, 0.15), _slope(length / 2, 0.5 * height, 0.24 * length, belt)],
+    )
+    cabin = make_solid(
+        (-0.14 * length, -half, belt),
+        (0.24 * length, half, height),
+        material=Material.PAINT,
+        cuts=[_slope(0.24 * length, belt, 0.11 * length, height), *_leaning_sides(half - 0.05, belt, 12.0)],
+        cut_material=Material.GLASS,
+    )
+    return [lower, cabin, *_wheels((-0.3 * length, 0.31 * length), half, 0.38)]
 
 
 def _van(length: float, width: float, height: float) -> list[Solid]:

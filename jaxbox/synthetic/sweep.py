@@ -147,6 +147,8 @@ def scan(
     range_noise_m: float = RANGE_NOISE_M,
     dropout: float = DROPOUT,
     image: bool = False,
+    elevation_deg: tuple[float, float] | None = None,
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> SyntheticSweep:
     """Casts every beam of one turn at a scene.
 
@@ -158,6 +160,8 @@ def scan(
       range_noise_m: standard deviation of the range, m; the direction is exact.
       dropout: share of returns lost at random, besides those too weak to detect.
       image: whether the camera's picture is rendered too.
+      elevation_deg: of the highest and the lowest beam, evenly spaced, instead of those.
+      origin: (3,) m, where another sensor stands in the frame of the scene, in which its points are given.
 
     Returns:
       The points that came back, and the truth.
@@ -167,9 +171,9 @@ def scan(
     """
     check_sensor(num_beams, num_azimuths, range_noise_m, dropout)
     rng = np.random.default_rng((seed, 1))
-    directions = beam_directions(num_beams, num_azimuths)
+    directions = beam_directions(num_beams, num_azimuths, elevation_deg)
     draw = rng.random(len(directions))
-    hits = cast(scene, np.zeros(3), directions, draw)
+    hits = cast(scene, np.array(origin), directions, draw)
     echoes = echoes_of(scene, hits, directions)
     returned, xyz, intensity = receive(
         rng, directions, echoes, draw, range_noise_m=range_noise_m, dropout=dropout
@@ -177,7 +181,7 @@ def scan(
     object_id = hits.object_id[returned]
     calibration = make_calibration()
     return SyntheticSweep(
-        xyz=xyz,
+        xyz=xyz + np.array(origin, np.float32),
         intensity=intensity,
         object_id=object_id,
         is_ground=object_id == Clutter.GROUND,
@@ -254,10 +258,14 @@ def check_sensor(num_beams: int, num_azimuths: int, range_noise_m: float, dropou
         raise ValueError(f"dropout is {dropout}; it must lie in [0, 1].")
 
 
-def beam_directions(num_beams: int, num_azimuths: int) -> np.ndarray:
+def beam_directions(
+    num_beams: int, num_azimuths: int, elevation_deg: tuple[float, float] | None = None
+) -> np.ndarray:
     """(num_beams x num_azimuths, 3) unit vectors: beams from the top, azimuth from +x counter-clockwise."""
     index = np.linspace(0, NUM_BEAMS - 1, num_beams)
     elevation = np.radians(np.interp(index, BEAM_INDEX, BEAM_ELEVATION_DEG))[:, None]
+    if elevation_deg is not None:
+        elevation = np.radians(np.linspace(*elevation_deg, num_beams))[:, None]
     azimuth = 2 * np.pi / num_azimuths * np.arange(num_azimuths)
     parts = np.broadcast_arrays(
         np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)

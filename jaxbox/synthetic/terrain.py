@@ -60,10 +60,12 @@ class Terrain:
     """Height of the sidewalk above the road."""
     visible: bool = True
     """False: things stand on it, but beams pass through."""
+    sensor_height_m: float = SENSOR_HEIGHT_M
+    """Of the origin above the ground below it."""
 
     def height(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Ground height z, m, sensor frame; -`SENSOR_HEIGHT_M` at the origin."""
-        return self._raw(x, y) - self._raw(np.zeros(()), np.zeros(())) - SENSOR_HEIGHT_M
+        """Ground height z, m, sensor frame; minus the sensor's height at the origin."""
+        return self._raw(x, y) - self._raw(np.zeros(()), np.zeros(())) - self.sensor_height_m
 
     def _raw(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         z = self.gradient[0] * x + self.gradient[1] * y

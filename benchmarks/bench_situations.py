@@ -1,0 +1,85 @@
+"""What is found of cars in hard situations, and whether the status says where they are missed.
+
+    python -m benchmarks.bench_situations --json benchmarks/results/situations.json
+    python -m benchmarks.bench_situations --only "under a ceiling"
+
+Each situation of `jaxbox.synthetic.situations` is one sweep or a few, with exact truth. Vehicles of 30
+points or more count. One is *found* where a box from `jaxbox.DEFAULT_SCORE_THRESHOLD` on covers it with a
+bird's-eye view IoU of .5 or more, whatever its class; missed *loudly* where the status has a bit, and
+*silently* where it has none. *False* boxes cover none.
+"""
+
+import collections
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from benchmarks import common
+from jaxbox import DEFAULT_SCORE_THRESHOLD, Detections, PointCloud, detect
+from jaxbox.evaluation.iou import pairwise_overlaps
+from jaxbox.synthetic import TruthBoxes
+from jaxbox.synthetic.situations import SITUATIONS, Situation
+
+MIN_OVERLAP = 0.5
+MIN_POINTS = 30
+"""A vehicle with fewer is hidden, or beyond the reach of the beams."""
+CAPACITY = 131_072
+"""Rows of every cloud, so that one compiled function serves all."""
+COLUMNS = "vehicles", "found", "loud", "silent", "false"
+
+
+def count(truth: TruthBoxes, detections: Detections) -> dict[str, int]:
+    """The columns of the table, of one sweep."""
+    boxes = detections.on_host().above(DEFAULT_SCORE_THRESHOLD)
+    overlap, _ = pairwise_overlaps(rows_of(truth), rows_of(boxes))
+    is_match = overlap >= MIN_OVERLAP
+    is_found, is_seen = is_match.any(axis=1), truth.num_points >= MIN_POINTS
+    missed, is_loud = int((is_seen & ~is_found).sum()), int(detections.status) != 0
+    return {
+        "vehicles": int(is_seen.sum()),
+        "found": int((is_seen & is_found).sum()),
+        "loud": missed if is_loud else 0,
+        "silent": 0 if is_loud else missed,
+        "false": int((~is_match.any(axis=0)).sum()),
+    }
+
+
+def rows_of(boxes: TruthBoxes | Detections) -> np.ndarray:
+    """(n, 7) x, y, z, length, width, height, yaw."""
+    return np.column_stack([np.asarray(part) for part in (boxes.center, boxes.size, boxes.yaw)])
+
+
+def measure(
+    situation: Situation, find: Callable[[np.ndarray], Detections], *, num_azimuths: int | None = None
+) -> dict[str, Any]:
+    """The columns of one situation, and the status bits of its sweeps."""
+    total: collections.Counter[str] = collections.Counter(dict.fromkeys(COLUMNS, 0))
+    statuses = []
+    for xyz, truth in situation.sweeps(**({} if num_azimuths is None else {"num_azimuths": num_azimuths})):
+        detections = find(xyz)
+        total.update(count(truth, detections))
+        statuses.append(int(detections.status))
+    row = {"group": situation.group, "situation": situation.name}
+    return row | {name: total[name] for name in COLUMNS} | {"status": common.status_names(statuses)}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Prints the table, and writes the report."""
+    groups = list(dict.fromkeys(situation.group for situation in SITUATIONS))
+    parser = common.parser(__doc__ or "")
+    parser.add_argument("--only", nargs="+", choices=groups, default=groups, help="these groups")
+    options = parser.parse_args(arguments)
+    config = common.chosen_config(options)
+
+    def find(xyz: np.ndarray) -> Detections:
+        return detect(PointCloud.from_numpy(xyz, capacity=CAPACITY), config)
+
+    rows = [measure(situation, find) for situation in SITUATIONS if situation.group in options.only]
+    cells = [[*list(row.values())[:-1], ", ".join(row["status"])] for row in rows]
+    common.print_table(list(rows[0]), cells)
+    common.write_report({"rows": rows}, options)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""The table of situations: exact scenes, what is counted, and a short form of the benchmark."""
+
+import collections
+import json
+import pathlib
+import types
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks import bench_situations
+from jaxbox import DetectorConfig, PointCloud, Status, detect
+from jaxbox.evaluation.iou import pairwise_overlaps
+from jaxbox.synthetic import TruthBoxes
+from jaxbox.synthetic.scene import outline
+from jaxbox.synthetic.situations import SITUATIONS
+from jaxbox.synthetic.solids import Solid
+
+RESULTS = pathlib.Path(__file__).parents[1] / "benchmarks" / "results"
+BY_TITLE = {situation.title: situation for situation in SITUATIONS}
+IN_SHORT = {
+    "open street: as it is": 10,
+    "beside a wall: 0.2 m": 6,
+    "beside a hedge: 0.2 m": 6,
+    "under a ceiling: 2.3 m": 6,
+    "under a ceiling: 3 m": 6,
+}
+"""Situations that the suite runs, and how many vehicles are to be found in each."""
+
+
+@pytest.mark.parametrize("situation", SITUATIONS, ids=lambda situation: situation.title)
+def test_vehicles_of_a_situation_stand_apart_and_hold_their_points(situation):
+    for xyz, truth in situation.sweeps(num_azimuths=200):
+        rows = bench_situations.rows_of(truth)
+        overlap, _ = pairwise_overlaps(rows, rows)
+        np.testing.assert_allclose(overlap, np.eye(len(rows)), atol=1e-6)
+        c, s = np.cos(truth.yaw), np.sin(truth.yaw)
+        dx, dy = xyz[:, :1] - truth.center[:, 0], xyz[:, 1:2] - truth.center[:, 1]
+        out = np.maximum(
+            np.abs(dx * c + dy * s) - truth.size[:, 0] / 2, np.abs(dy * c - dx * s) - truth.size[:, 1] / 2
+        )
+        # Five standard deviations of the noise.
+        assert ((out < 0.1 * situation.scale).sum(axis=0) >= truth.num_points).all()
+        assert truth.num_points.max() >= 10
+
+
+@pytest.mark.parametrize("gap_m", [0.1, 0.2, 0.3])
+@pytest.mark.parametrize("thing", ["wall", "rail"])
+def test_cars_beside_a_thing_are_as_far_from_it_as_said(thing, gap_m):
+    scene, *_ = BY_TITLE[f"beside a {thing}: {gap_m:g} m"].scenes
+    # The second of a block's six faces looks along +y, the fifth along -y.
+    left = min(-float(s.offsets[4]) for s in scene.clutter[0].shapes if isinstance(s, Solid))
+    right = max(float(s.offsets[1]) for s in scene.clutter[1].shapes if isinstance(s, Solid))
+    reach = [outline(vehicle)[:, 1] for vehicle in scene.vehicles]
+    np.testing.assert_allclose([left - y.max() for y in reach[:3]], gap_m, atol=1e-9)
+    np.testing.assert_allclose([y.min() - right for y in reach[3:]], gap_m, atol=1e-9)
+
+
+def test_the_same_situation_gives_the_same_bits():
+    situation = BY_TITLE["beside a hedge: 0.2 m"]
+    first, again = (situation.sweeps(num_azimuths=100)[0][0] for _ in range(2))
+    assert first.tobytes() == again.tobytes()
+
+
+def test_titles_are_unique():
+    assert len(BY_TITLE) == len(SITUATIONS)
+
+
+@pytest.mark.parametrize("status", [Status.OK, Status.NO_GROUND])
+def test_what_is_counted_is_what_is_worked_out_by_hand(status):
+    truth = TruthBoxes(
+        center=np.array([[10.0, 0, -1], [20, 0, -1], [30, 0, -1], [40, 0, -1]]),
+        size=np.tile([4.0, 2.0, 1.5], (4, 1)),
+        yaw=np.zeros(4),
+        label=np.zeros(4, int),
+        num_points=np.array([100, 100, 30, 29]),
+        visible=np.ones(4),
+    )
+    # The first is met exactly, the second by a box 1.5 m off (IoU 10 / 22), the third by none. The fourth has
+    # too few points.
+    boxes = types.SimpleNamespace(
+        center=np.array([[10.0, 0, -1], [21.5, 0, -1], [40, 0, -1]]), size=truth.size[:3], yaw=np.zeros(3)
+    )
+    found: Any = types.SimpleNamespace(on_host=lambda: found, above=lambda _: boxes, status=int(status))
+    loud, silent = (2, 0) if status else (0, 2)
+    expected = {"vehicles": 3, "found": 1, "loud": loud, "silent": silent, "false": 1}
+    assert bench_situations.count(truth, found) == expected
+
+
+@pytest.fixture(scope="module")
+def find():
+    config = DetectorConfig()
+    return lambda xyz: detect(PointCloud.from_numpy(xyz, capacity=bench_situations.CAPACITY), config)
+
+
+@pytest.mark.parametrize("title", IN_SHORT)
+def test_what_is_said_to_be_found_is_found(title, find):
+    assert bench_situations.measure(BY_TITLE[title], find)["found"] >= IN_SHORT[title]
+
+
+@pytest.mark.parametrize("name", ["situations", "situations_before"])
+def test_the_recorded_table_is_that_of_the_code(name):
+    rows = json.loads((RESULTS / f"{name}.json").read_text())["rows"]
+    assert [f"{row['group']}: {row['situation']}" for row in rows] == list(BY_TITLE)
+    for row in rows:
+        situation = BY_TITLE[f"{row['group']}: {row['situation']}"]
+        assert row["vehicles"] <= sum(len(scene.vehicles) for scene in situation.scenes)
+        assert row["vehicles"] == row["found"] + row["loud"] + row["silent"]
+        assert not row["loud"] or row["status"]
+    assert collections.Counter(row["group"] for row in rows).keys() == {s.group for s in SITUATIONS}
