@@ -51,6 +51,7 @@ OWN = {
     "io/foxglove.py": "chosen colours",
     "io/nuscenes.py": "its name for vans",
     "synthetic/scene.py": "sizes and shares of a street's vehicles",
+    "synthetic/situations.py": "trucks and box vans among the situations",
     "synthetic/solids.py": "shapes",
     "synthetic/traffic.py": "who plays which part in a drive",
 }
