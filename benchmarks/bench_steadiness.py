@@ -18,7 +18,7 @@ import jaxbox
 from benchmarks import common
 from jaxbox import DEFAULT_SCORE_THRESHOLD, Detections, DetectorConfig, Tracks
 from jaxbox.evaluation.iou import pairwise_overlaps
-from jaxbox.io import Sweep, group_sequences, open_sweeps
+from jaxbox.io import Sweep, find_poses, group_sequences, open_sweeps
 
 PARTS = ("boxes", "tracks")
 FRAMES = ("kitti_object", "kitti_object_more")
@@ -62,10 +62,11 @@ def rows_of(found: Detections | Tracks) -> np.ndarray:
 def judge(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which boxes stay, and which are found at all, (n,) bool each."""
     if not len(before) or not len(after):
-        return (np.zeros(len(before), bool),) * 2
+        return np.zeros(len(before), bool), np.zeros(len(before), bool)
     overlap = pairwise_overlaps(before[:, :7], after[:, :7])[0]
     same = before[:, None, 8] == after[None, :, 8]
-    return ((overlap >= MIN_OVERLAP) & same).any(axis=1), (overlap >= FOUND_OVERLAP).any(axis=1)
+    stay, found = (overlap >= MIN_OVERLAP) & same, overlap >= FOUND_OVERLAP
+    return np.any(stay, axis=1), np.any(found, axis=1)
 
 
 class Tally:
@@ -123,7 +124,9 @@ def measure_tracks(config: DetectorConfig, limit: int | None) -> dict[str, Any]:
 def track_boxes(sweeps: Sequence[Sweep], config: DetectorConfig, change: str) -> Iterator[np.ndarray]:
     """The rows of each sweep's tracks."""
     clouds = (changed(sweep, change, 0) for sweep in sweeps)
-    for tracked in jaxbox.track(clouds, config, poses=jaxbox.io.find_poses(sweeps)):
+    for tracked in jaxbox.track(clouds, config, poses=find_poses(sweeps)):
+        if tracked.tracks is None:
+            raise SystemExit(f"{tracked.name}: {tracked.error}")
         yield rows_of(tracked.tracks)
 
 
