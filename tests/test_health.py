@@ -29,7 +29,9 @@ def doubts(xyz, **limits):
 
 def spoiled(xyz, kind, amount):
     none = np.zeros(len(xyz), np.float32)
-    return CORRUPTIONS[kind].of_points(xyz, none, amount, np.random.default_rng(0))[0]
+    of_points = CORRUPTIONS[kind].of_points
+    assert of_points is not None
+    return of_points(xyz, none, amount, np.random.default_rng(0))[0]
 
 
 def test_a_clear_sweep_is_not_doubted(street):

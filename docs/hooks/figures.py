@@ -263,6 +263,18 @@ def corruption() -> str:
     return table(["", "amount", *names.values()], rows) + made_with(report)
 
 
+def steadiness() -> str:
+    """Shares of boxes that stay, by what is done to the sweep, before the last change to it and now."""
+    before, now = load("steadiness_before"), load("steadiness")
+    rows = [
+        (part, change, score, shares["boxes"], *(100 * r[part][change][score]["stay"] for r in (before, now)))
+        for part in ("boxes", "tracks")
+        for change, by_score in now[part].items()
+        for score, shares in by_score.items()
+    ]
+    return table(["of", "change", "from score", "boxes", "% stayed before", "% stay"], rows) + made_with(now)
+
+
 def mutation() -> str:
     """Mutants by module and outcome."""
     report = load("mutation")
@@ -650,6 +662,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "fuzz": fuzz,
     "faults": faults,
     "corruption": corruption,
+    "steadiness": steadiness,
     "mutation": mutation,
     "coverage": coverage,
     "cluster": cluster,
