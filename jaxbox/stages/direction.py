@@ -87,8 +87,8 @@ def count_votes(
 ) -> jax.Array:
     """Prefers the direction that most boxes share: vehicles stand along or across one road.
 
-    Every direction is preferred by its share (votes / most votes)^8, and what is near it as far as it is close:
-    so no vote more or less makes the preference jump from one of two like directions to the other.
+    Every direction is preferred by its share (votes / most votes)^8, and those near it as they are close: so no
+    vote more or less makes the preference jump from one of two like directions to the other.
 
     Args:
       yaw: (K,) float32, rad, of the voting boxes.
