@@ -1,6 +1,5 @@
 """Assembly of the answer: which points each detection has, the counts of everything, and the status."""
 
-import dataclasses
 import functools
 from typing import NamedTuple
 
@@ -176,7 +175,7 @@ def _count_points(found: Found, config: DetectorConfig) -> jax.Array:
 
 def _counts(points: jax.Array, cloud: PointCloud, found: Found, largest_hull: jax.Array) -> Counts:
     is_point, finite, in_region, inliers, ground, overhead, clustered = points
-    obstacles, clusters = found.obstacles, found.clusters
+    obstacles, clusters, health = found.obstacles, found.clusters, found.health
     num_obstacles = jnp.minimum(obstacles.count, obstacles.row.shape[0])
     return Counts(
         # Of a cloud that was made by hand, and says that it has fewer points than rows, none were dropped.
@@ -198,7 +197,11 @@ def _counts(points: jax.Array, cloud: PointCloud, found: Found, largest_hull: ja
         candidates=found.candidates.num,
         detections=found.kept.num,
         hull_vertices=largest_hull,
-        **{field.name: getattr(found.health, field.name) for field in dataclasses.fields(found.health)},
+        far_points=health.far_points,
+        scattered_azimuths=health.scattered_azimuths,
+        near_ground_points=health.near_ground_points,
+        rough_points=health.rough_points,
+        points_under=health.points_under,
     )
 
 

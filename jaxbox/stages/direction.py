@@ -87,7 +87,7 @@ def count_votes(
 ) -> jax.Array:
     """Prefers the direction that most boxes share: vehicles stand along or across one road.
 
-    Every direction is preferred by its share (votes / most votes)^8, and those near it as they are close: so no
+    Every direction is preferred by its share (votes / most votes)^8, and those near it by closeness: so no
     vote more or less makes the preference jump from one of two like directions to the other.
 
     Args:

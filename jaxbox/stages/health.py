@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from jaxbox.config import GroundConfig, HealthConfig
 from jaxbox.stages.state import Evidence, Ground, Health, Sweep
-from jaxbox.xla.range_bits import BLOCK
+from jaxbox.xla.range_bits import shared_cells
 from jaxbox.xla.rows import count_each, count_true
 
 NEAR_M = (3.0, 12.0)
@@ -59,5 +59,4 @@ def _scattered_azimuths(evidence: Evidence | None) -> jax.Array:
     """() int32: azimuth cells in which a cell of the nearest block was both hit and seen through."""
     if evidence is None:
         return jnp.int32(0)
-    both = evidence.hit[0] & evidence.free[0] & (2**BLOCK - 1)
-    return count_true(both > 0)
+    return count_true(shared_cells(evidence.hit[0], evidence.free[0]) > 0)
