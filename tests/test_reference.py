@@ -647,19 +647,6 @@ def test_scene_direction_is_the_heavier_vote_modulo_a_quarter_turn():
     np.testing.assert_allclose(gain[[89, 0, 86]], 0.2 * np.exp([0, -1 / 9, -1]))
 
 
-def test_the_preference_for_two_like_directions_does_not_jump_between_them():
-    config = BoxConfig(direction_weight=0.2, direction_sigma_deg=3.0)
-    yaw, extent, voting = np.radians([10.0, 60.0]), np.full(2, 4.0), np.full(2, True)
-
-    def preference(*points):
-        return reference.count_votes(yaw, extent, np.array(points), np.ones(2), voting, config)
-
-    before, after = preference(100, 99), preference(99, 100)
-    assert before[10] == after[60] == 0.2
-    assert np.abs(before - after).max() < 0.2 * 0.1
-    assert preference(100, 50)[60] == pytest.approx(0.2 / 2**8)
-
-
 # ---------------------------------------------------------------- vehicles
 
 

@@ -264,15 +264,16 @@ def corruption() -> str:
 
 
 def steadiness() -> str:
-    """Shares of boxes that stay, by what is done to the sweep, before the last change to it and now."""
-    before, now = load("steadiness_before"), load("steadiness")
+    """Shares of boxes that stay, by what is done to the sweep."""
+    report = load("steadiness")
     rows = [
-        (part, change, score, shares["boxes"], *(100 * r[part][change][score]["stay"] for r in (before, now)))
+        (part, change, score, shares["boxes"], 100 * shares["stay"], 100 * shares["found"])
         for part in ("boxes", "tracks")
-        for change, by_score in now[part].items()
+        for change, by_score in report[part].items()
         for score, shares in by_score.items()
     ]
-    return table(["of", "change", "from score", "boxes", "% stayed before", "% stay"], rows) + made_with(now)
+    header = ["of", "change", "from score", "boxes", "% that stay", "% with a box of IoU .5"]
+    return table(header, rows) + made_with(report)
 
 
 def mutation() -> str:

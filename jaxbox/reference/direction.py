@@ -12,8 +12,6 @@ from jaxbox.reference.state import Cluster, Evidence, Rectangle
 
 VOTE_POINTS, VOTE_EXTENT_M = 150, 6.0
 """A cluster with more points, or longer, has no more say about the scene's direction."""
-SHARPNESS = 8
-"""Power by which a direction with fewer votes than the first is preferred less."""
 
 
 def scene_preference(
@@ -78,7 +76,7 @@ def count_votes(
     voting: np.ndarray,
     config: BoxConfig,
 ) -> np.ndarray:
-    """Prefers the directions modulo 90 degrees that most boxes share.
+    """Prefers the direction modulo 90 degrees that most boxes share.
 
     Args:
       yaw: (k,) rad.
@@ -86,8 +84,8 @@ def count_votes(
       num_points: (k,) points of the cluster.
       score: (k,) in [0, 1], how much each looks like a car.
       voting: (k,) bool.
-      config: A angles, i 90 / A degrees; a vote weighs exp(-(d / sigma)^2) at distance d. So does
-        the preference for a direction, times (its votes / the most)^8 and the height; the largest counts.
+      config: A angles, i 90 / A degrees; a vote for d weighs exp(-(d / sigma)^2) at distance d, and so
+        does the preference, times its height.
 
     Returns:
       (A,) to be added to the curves; zero where no box votes.
@@ -99,10 +97,9 @@ def count_votes(
         return np.zeros(num_angles)
     angles = np.arange(num_angles) * 90 / num_angles
     distance = _turn_between_deg(angles[:, None], np.degrees(yaw[voting]))
-    votes = np.exp(-((distance / sigma_deg) ** 2)) @ weight
-    closeness = np.exp(-((_turn_between_deg(angles[:, None], angles) / sigma_deg) ** 2))
-    share = (votes / votes.max()) ** SHARPNESS
-    return float(config.direction_weight) * (closeness * share).max(axis=1)
+    direction_deg = angles[np.argmax(np.exp(-((distance / sigma_deg) ** 2)) @ weight)]
+    distance = _turn_between_deg(angles, direction_deg)
+    return float(config.direction_weight) * np.exp(-((distance / sigma_deg) ** 2))
 
 
 def _turn_between_deg(first: np.ndarray, second: np.ndarray | float) -> np.ndarray:

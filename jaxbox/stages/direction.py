@@ -17,9 +17,6 @@ from jaxbox.xla.rows import compact, rows_in_use, take
 VOTE_POINTS, VOTE_EXTENT_M = 150.0, 6.0
 """A vote for the scene's direction counts min(points, 150) x min(extent, 6 m) x the score as a car."""
 
-SHARPNESS = 8
-"""A direction with half the votes of the first is preferred by 1 / 2^8 of that one's preference."""
-
 
 def scene_preference(
     rectangles: Rectangles, clusters: Clusters, cast_rays: CastRays, config: DetectorConfig
@@ -87,9 +84,6 @@ def count_votes(
 ) -> jax.Array:
     """Prefers the direction that most boxes share: vehicles stand along or across one road.
 
-    Every direction is preferred by its share (votes / most votes)^8, and those near it by closeness: so no
-    vote more or less makes the preference jump from one of two like directions to the other.
-
     Args:
       yaw: (K,) float32, rad, of the voting boxes.
       extent: (K,) float32, m, the longest measured extent of each.
@@ -120,7 +114,5 @@ def count_votes(
     votes = fold_rows(
         add, votes, ballots, num_rows=rows_in_use(voting), chunk=chunks.VOTES, absent=(0.0, 0.0)
     )
-    # Every direction is preferred by the height of its votes, so that two of like height may change places
-    # without a jump.
-    share = votes / jnp.maximum(jnp.max(votes), jnp.finfo(jnp.float32).tiny)
-    return config.direction_weight * jnp.max(closeness(bins) * share[:, None] ** SHARPNESS, axis=0)
+    direction = bins[jax.lax.argmax(votes, 0, jnp.int32)]
+    return jnp.where(jnp.max(votes) > 0, config.direction_weight * closeness(direction[None])[0], 0)
