@@ -120,9 +120,9 @@ def plot(report: Mapping[str, Any], path: pathlib.Path) -> None:
     from matplotlib.figure import Figure  # noqa: PLC0415 (an extra: imported where it is used)
 
     kinds = report["corruptions"]
-    columns = 3
+    columns = 4
     rows = -(-len(kinds) // columns)
-    figure = Figure(figsize=(9, 0.5 + 2.2 * rows), layout="constrained")
+    figure = Figure(figsize=(9, 0.5 + 1.9 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False).ravel()
     for panel, (name, kind) in zip(panels, kinds.items(), strict=False):
         rungs = [report[CLEAN], *kind["severities"]]
@@ -131,7 +131,7 @@ def plot(report: Mapping[str, Any], path: pathlib.Path) -> None:
             mean = [scale * rung["mean"][key] for rung in rungs]
             sd = [scale * rung["sd"][key] for rung in rungs]
             panel.errorbar(range(len(rungs)), mean, yerr=sd, marker="o", markersize=3, capsize=2, label=label)
-        panel.set_title(f"{CORRUPTIONS[name].title} ({CORRUPTIONS[name].unit})", fontsize=9)
+        panel.set_title(f"{CORRUPTIONS[name].title} ({CORRUPTIONS[name].unit})", fontsize=7)
         ticks = [CLEAN, *(f"{rung['amount']:g}" for rung in kind["severities"])]
         panel.set_xticks(range(len(ticks)), ticks, fontsize=8)
         panel.set_ylim(0, 100)

@@ -50,6 +50,8 @@ class Status(enum.IntFlag):
     HULL_OVERFLOW = 512
     GROUND_ABOVE = 1024
     ASSIGNMENT_OVERFLOW = 2048
+    DEGRADED = 4096
+    DOUBTFUL_GROUND = 8192
 
     def describe(self) -> list[str]:
         """Returns one sentence a set bit: what happened and what to do about it.
@@ -75,6 +77,12 @@ _STATUS_TEXT = {
     Status.GROUND_ABOVE: "the ground lies above the origin, so that vehicles hang from it and are not found. "
     "The sensor is mounted upside down, z points down, or the points are not in the sensor's frame; turn or "
     "move them first.",
+    Status.DEGRADED: "the returns are those of fog, heavy rain, snow, dust or a failing sensor: nearly none "
+    "from afar, many from the air near by, or a blurred ground, and vehicles may be missing. Compare the "
+    "counts with those of a good sweep; the limits are the settings under health.",
+    Status.DOUBTFUL_GROUND: "the ground lies farther below the origin, or steeper, than a road lies under a "
+    "vehicle's sensor, or right under it where no sensor looks. The points are not in metres, the sensor is "
+    "tilted, or it is not at the origin; scale, turn or move them first.",
 } | {bit: "; or ".join(row.overflow for row in rows) + "." for bit, rows in _OVERFLOW_ROWS.items()}
 
 
@@ -291,6 +299,17 @@ class Counts(ByValue):
     """() int32: boxes after suppression."""
     hull_vertices: jax.Array
     """() int32: vertices of the largest hull."""
+    far_points: jax.Array
+    """() int32: finite points farther than health.far_m, or outside the region."""
+    scattered_azimuths: jax.Array
+    """() int32: azimuth cells of the evidence in which a return from the nearest 16 range cells (4 m) was
+    passed by another beam; 0 without evidence."""
+    near_ground_points: jax.Array
+    """() int32: points 3 to 12 m away that lie within 0.3 m of the ground; 0 without the ground grid."""
+    rough_points: jax.Array
+    """() int32: those of them that lie more than 0.05 m off it."""
+    points_under: jax.Array
+    """() int32: points on the ground that are nearer, in the plane, than 0.6 of the sensor's height."""
 
     @property
     def num_points(self) -> int:

@@ -217,6 +217,8 @@ LOST = Status.NO_GROUND
 EMPTY = Status.EMPTY | Status.NO_GROUND
 NONFINITE = Status.NONFINITE_POINTS
 ABOVE = Status.GROUND_ABOVE
+DEGRADED = Status.DEGRADED
+DOUBTFUL = Status.DOUBTFUL_GROUND
 
 
 def _both(status: Status) -> dict[str, Status]:
@@ -270,7 +272,7 @@ WORLDS = (
     Case(
         "collinear, level",
         _fixed(np.linspace([-50, -20, -1.7], [50, 20, -1.7], 5000)),
-        _both(OK),
+        _both(DOUBTFUL),
         best_score=0,
     ),
     Case("collinear, upright", _fixed(np.linspace([9, 3, -2], [9, 3, 2], 500)), _both(LOST), best_score=0),
@@ -285,24 +287,24 @@ WORLDS = (
     ),
     Case("coplanar, at 20 degrees", _tilted, _both(LOST), best_score=DEFAULT_SCORE_THRESHOLD),
     Case("all ground", lambda: (synthetic.ground_only_sweep().xyz[::8], None), _both(OK), best_score=0),
-    Case("no ground", lambda: (synthetic.no_ground_sweep().xyz[::8], None), _both(OK)),
+    Case("no ground", lambda: (synthetic.no_ground_sweep().xyz[::8], None), _each(DEGRADED, OK)),
     Case(
         "one wall",
         lambda: (synthetic.one_wall_sweep().xyz[::4], None),
-        _each(OK, LOST),
+        _each(DEGRADED, LOST),
         best_score=DEFAULT_SCORE_THRESHOLD,
     ),
     Case("sensor upside down", _turned_over, _both(ABOVE), best_score=DEFAULT_SCORE_THRESHOLD),
     Case(
         "sensor on its side",
         lambda: (street()[:, [0, 2, 1]], None),
-        _each(OK, LOST),
+        _each(DOUBTFUL, LOST),
         best_score=DEFAULT_SCORE_THRESHOLD,
     ),
     Case(
         "one beam",
         lambda: (street()[np.abs(street()[:, 2] + 0.9) < 0.05], None),
-        _both(OK),
+        _both(DEGRADED),
         best_score=DEFAULT_SCORE_THRESHOLD,
     ),
     Case(
@@ -317,7 +319,7 @@ WORLDS = (
     Case(
         "dense noise",
         _fixed(_uniform([-15, -15, -2], [15, 15, 2], 16000)),
-        _each(Status.OBSTACLE_OVERFLOW, OK),
+        _each(Status.OBSTACLE_OVERFLOW | DEGRADED, DEGRADED),
         best_score=DEFAULT_SCORE_THRESHOLD,
     ),
 )
@@ -358,7 +360,7 @@ TOO_MANY = (
         "1,000,000 points for 16,384",
         _million,
         _each(
-            Status.POINT_OVERFLOW | Status.OBSTACLE_OVERFLOW,
+            Status.POINT_OVERFLOW | Status.OBSTACLE_OVERFLOW | DEGRADED,
             Status.POINT_OVERFLOW | Status.OBSTACLE_OVERFLOW | LOST,
         ),
     ),
@@ -386,7 +388,7 @@ TOO_MANY = (
     Case(
         "more corners of a hull",
         lambda: (np.concatenate([_ground(6000), _disc(600)]), None),
-        _each(OK, Status.HULL_OVERFLOW),
+        _each(DOUBTFUL, Status.HULL_OVERFLOW | DOUBTFUL),
     ),
     Case(
         "more candidates, detections and corners",

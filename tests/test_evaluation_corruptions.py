@@ -50,13 +50,13 @@ def test_every_severity_is_seeded_finite_float32_and_adds_no_point(name, sweep):
         assert np.isfinite(intensity).all()
 
 
-@pytest.mark.parametrize("name", ["beams", "dropout", "fog"])
+@pytest.mark.parametrize("name", ["beams", "dropout", "fog", "rain"])
 def test_each_severity_leaves_fewer_points(name, sweep):
     counts = [len(sweep.xyz), *(len(corrupted(name, sweep, a)[0]) for a in CORRUPTIONS[name].amounts)]
     assert all(after < before for before, after in itertools.pairwise(counts))
 
 
-@pytest.mark.parametrize("name", ["noise", "clutter", "reflections", "speed", "turning"])
+@pytest.mark.parametrize("name", ["noise", "clutter", "snow", "spray", "reflections", "speed", "turning"])
 def test_each_severity_moves_points_farther(name, sweep):
     moved = [
         np.linalg.norm(corrupted(name, sweep, a)[0] - sweep.xyz, axis=1).mean()
@@ -66,7 +66,7 @@ def test_each_severity_moves_points_farther(name, sweep):
     assert all(after > before for before, after in itertools.pairwise(moved))
 
 
-@pytest.mark.parametrize("name", ["noise", "fog", "clutter", "dropout"])
+@pytest.mark.parametrize("name", ["noise", "fog", "rain", "snow", "spray", "clutter", "dropout"])
 def test_another_seed_draws_otherwise(name, sweep):
     amount = CORRUPTIONS[name].amounts[2]
     assert not np.array_equal(corrupted(name, sweep, amount)[0], corrupted(name, sweep, amount, seed=1)[0])
@@ -131,6 +131,36 @@ def test_clutter_is_the_share_of_beams_and_nearer_than_the_surface(sweep):
     assert np.all(intensity[shorter] == 0)
     np.testing.assert_allclose(ranges(xyz)[~shorter], ranges(sweep.xyz)[~shorter], rtol=1e-5)
     assert ranges(xyz)[shorter].min() >= corruptions.MIN_RANGE_M - 1e-4
+
+
+def test_rain_takes_the_far_and_blurs_the_others_by_their_range():
+    far, near = np.full((4000, 3), [100.0, 0, 0]), np.full((4000, 3), [0.0, 20.0, 0])
+    rng, rate_mm_h = np.random.default_rng(0), 1.0
+    left, weaker = corruptions.add_rain(near, np.ones(4000), rate_mm_h, rng)
+    assert len(corruptions.add_rain(far, np.ones(4000), 20.0, rng)[0]) == 0
+    std_m = corruptions.RAIN_NOISE * 20 * (1 - math.exp(-rate_mm_h)) ** 2
+    assert np.std(left[:, 1]) == pytest.approx(std_m, rel=0.05)
+    np.testing.assert_allclose(weaker, math.exp(-2 * corruptions.RAIN_EXTINCTION * 20), rtol=1e-5)
+
+
+def test_snow_returns_near_the_sensor_from_no_more_than_the_share():
+    distant = np.full((4000, 3), [60.0, 0, 0])
+    xyz, intensity = corruptions.add_snow(distant, np.ones(4000), 0.3, np.random.default_rng(0))
+    flakes = intensity == 0
+    assert flakes.mean() == pytest.approx(0.3, abs=0.03)
+    assert xyz[flakes, 0].min() >= corruptions.MIN_RANGE_M
+    beyond_m = xyz[flakes, 0].mean() - corruptions.MIN_RANGE_M
+    assert beyond_m == pytest.approx(corruptions.SNOW_RANGE_M, rel=0.1)
+    np.testing.assert_array_equal(xyz[~flakes], distant[~flakes])
+
+
+def test_spray_returns_from_within_its_plumes_alone(sweep):
+    xyz, intensity = corruptions.add_spray(sweep.xyz, np.ones(len(sweep.xyz)), 1, np.random.default_rng(0))
+    drops = xyz[intensity == 0]
+    assert len(drops) > 10
+    assert np.ptp(drops, axis=0).max() <= 2 * corruptions.PLUME_RADIUS_M
+    assert abs(drops[:, 2] - corruptions.PLUME_Z_M).max() <= corruptions.PLUME_RADIUS_M
+    np.testing.assert_allclose(xyz[intensity > 0], sweep.xyz[intensity > 0], rtol=1e-6)
 
 
 def test_motion_leaves_what_is_straight_ahead_and_carries_the_sides_by_the_way_gone():

@@ -263,6 +263,19 @@ def corruption() -> str:
     return table(["", "amount", *names.values()], rows) + made_with(report)
 
 
+def steadiness() -> str:
+    """Shares of boxes that stay, by what is done to the sweep."""
+    report = load("steadiness")
+    rows = [
+        (part, change, score, shares["boxes"], 100 * shares["stay"], 100 * shares["found"])
+        for part in ("boxes", "tracks")
+        for change, by_score in report[part].items()
+        for score, shares in by_score.items()
+    ]
+    header = ["of", "change", "from score", "boxes", "% that stay", "% with a box of IoU .5"]
+    return table(header, rows) + made_with(report)
+
+
 def mutation() -> str:
     """Mutants by module and outcome."""
     report = load("mutation")
@@ -666,6 +679,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "fuzz": fuzz,
     "faults": faults,
     "corruption": corruption,
+    "steadiness": steadiness,
     "mutation": mutation,
     "coverage": coverage,
     "cluster": cluster,

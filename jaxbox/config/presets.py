@@ -12,6 +12,7 @@ from jaxbox.config.schema import (
     EvidenceConfig,
     FilterConfig,
     GroundConfig,
+    HealthConfig,
     HullConfig,
     RegionConfig,
     VehicleConfig,
@@ -40,6 +41,7 @@ class DetectorConfig:
     box: BoxConfig = BoxConfig()
     completion: CompletionConfig = CompletionConfig()
     vehicles: VehicleConfig = VehicleConfig()
+    health: HealthConfig = HealthConfig()
 
     @classmethod
     def paper(cls) -> "DetectorConfig":

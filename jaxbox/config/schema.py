@@ -351,3 +351,23 @@ class VehicleConfig:
     """Boxes with lower scores are dropped. Where you act, cut at `DEFAULT_SCORE_THRESHOLD`."""
     max_overlap: Scalar = 0.1
     """Of two boxes with a larger bird's-eye view IoU, the lower-scoring is suppressed."""
+
+
+@config_class
+class HealthConfig:
+    """From where on the status doubts a sweep. No real sweep in clear weather that was at hand comes near."""
+
+    far_m: Scalar = 40.0
+    """Points farther than this, or outside the region, are far."""
+    min_far_share: Scalar = 0.004
+    """With a smaller share of far points the sweep is `DEGRADED`; 0 for sweeps that are cut off nearer."""
+    max_scattered_share: Scalar = 0.2
+    """So it is with a larger share of directions in which a return within 4 m is seen through."""
+    max_rough_share: Scalar = 0.72
+    """So it is with a larger share of the ground's points near by that lie 5 cm or more off its surface."""
+    max_sensor_height_m: Scalar = 4.5
+    """Ground farther below the origin is doubtful."""
+    max_tilt_deg: Scalar = 6.0
+    """So is steeper ground."""
+    max_under_share: Scalar = 0.0004
+    """So is ground with a larger share of the points right under the origin, steeper than sensors look."""

@@ -7,7 +7,8 @@ points of the clean one.
 
 References: Dong et al., "Benchmarking Robustness of 3D Object Detection to Common Corruptions", CVPR 2023
 (kinds, and the scale of noise); Hahner et al., "Fog Simulation on Real LiDAR Point Clouds for 3D Object
-Detection in Adverse Weather", ICCV 2021 (the LiDAR equation in fog).
+Detection in Adverse Weather", ICCV 2021 (the LiDAR equation in fog); Goodin et al., "Predicting the
+Influence of Rain on LIDAR in ADAS", Electronics 8(1), 2019 (loss and noise by the rate of rain).
 """
 
 import dataclasses
@@ -36,6 +37,24 @@ ROAD_BELOW_M = 1.3
 
 REFLECTION_DEPTHS_M = (0.2, 0.8)
 """How far below the road beams seem to end that it reflects."""
+
+RAIN_EXTINCTION, RAIN_NOISE = 0.01, 0.02
+"""Goodin et al.: loss a metre at 1 mm/h, and the largest error of a range, as a share of it."""
+
+SNOW_RANGE_M = 5.0
+"""Mean range of flakes beyond the nearest: nearly all returns from snow lie within 20 m of the sensor."""
+
+PLUME_RADIUS_M = 1.2
+"""Of the spray that wheels throw up: as wide as the car, as high as its roof."""
+
+PLUME_RANGES_M = (6.0, 30.0)
+"""Ranges of the plumes."""
+
+PLUME_Z_M = -1.0
+"""Of their centres, about .7 m above the road for sensors at about 1.7 m."""
+
+PLUME_SHARE = 0.5
+"""Of the beams through a plume that come back from it."""
 
 SWEEP_PERIOD_S = 0.1
 """Of one turn."""
@@ -111,9 +130,7 @@ def add_fog(xyz: np.ndarray, intensity: np.ndarray, visibility_m: float, rng: np
     """
     alpha = math.log(20) / visibility_m
     distance = np.linalg.norm(xyz, axis=1).astype(np.float64)
-    least = np.minimum((distance / REACH_M) ** 2, 1)
-    reflectivity = least + (1 - least) * rng.random(len(xyz))
-    seen = reflectivity * np.exp(-2 * alpha * distance) >= least
+    seen = _seen_through(distance, alpha, rng)
     scattered = ~seen & (rng.random(len(xyz)) < BACKSCATTER_SHARE) & (distance > MIN_RANGE_M)
     near = _truncated_exponential(rng.random(len(xyz)), 2 * alpha, MIN_RANGE_M, distance)
     scale = np.where(scattered, near / np.maximum(distance, MIN_RANGE_M), 1)
@@ -147,6 +164,88 @@ def add_clutter(xyz: np.ndarray, intensity: np.ndarray, share: float, rng: np.ra
     near = MIN_RANGE_M + rng.random(len(xyz)) * (distance - MIN_RANGE_M)
     scale = np.where(spurious, near / np.maximum(distance, MIN_RANGE_M), 1)
     return (xyz * scale[:, None]).astype(np.float32), np.where(spurious, 0, intensity).astype(np.float32)
+
+
+def add_rain(xyz: np.ndarray, intensity: np.ndarray, rate_mm_h: float, rng: np.random.Generator) -> Points:
+    """Weakens returns by rain, loses the too weak, and blurs the ranges of the others (Goodin et al.).
+
+    As in `add_fog` a return from R has the power rho / R^2 exp(-2 alpha R), with alpha = .01 r^.6 / m as they
+    fit it to a rate of r mm/h; the error of its range has the deviation .02 R (1 - exp(-r))^2.
+
+    Args:
+      xyz: (n, 3) m.
+      intensity: (n,).
+      rate_mm_h: r, mm/h; 0 is none, 10 heavy rain, 50 a cloudburst.
+      rng: draws which beams are lost, and the errors.
+
+    Returns:
+      The points left, with intensities weakened.
+    """
+    alpha = RAIN_EXTINCTION * rate_mm_h**0.6
+    distance = np.linalg.norm(xyz, axis=1).astype(np.float64)
+    seen = _seen_through(distance, alpha, rng)
+    std_m = RAIN_NOISE * distance * (1 - math.exp(-rate_mm_h)) ** 2
+    scale = 1 + rng.normal(0, 1, len(xyz)) * std_m / np.maximum(distance, MIN_RANGE_M)
+    weaker = intensity * np.exp(-2 * alpha * distance)
+    return (xyz * scale[:, None]).astype(np.float32)[seen], weaker.astype(np.float32)[seen]
+
+
+def _seen_through(distance: np.ndarray, alpha: float, rng: np.random.Generator) -> np.ndarray:
+    """(n,) bool: which returns are still strong enough where air takes exp(-alpha) a metre, see `add_fog`."""
+    least = np.minimum((distance / REACH_M) ** 2, 1)
+    reflectivity = least + (1 - least) * rng.random(len(distance))
+    return reflectivity * np.exp(-2 * alpha * distance) >= least
+
+
+def add_snow(xyz: np.ndarray, intensity: np.ndarray, share: float, rng: np.random.Generator) -> Points:
+    """Ends beams early near the sensor, as flakes, dust and exhaust do.
+
+    Args:
+      xyz: (n, 3) m.
+      intensity: (n,).
+      share: probability of each beam, 0 (none) to 1.
+      rng: draws which, and where: `MIN_RANGE_M` and more by an exponential of mean `SNOW_RANGE_M`, where that
+        is before the return.
+
+    Returns:
+      As many points; those of flakes have intensity 0.
+    """
+    distance = np.linalg.norm(xyz, axis=1)
+    near = MIN_RANGE_M + rng.exponential(SNOW_RANGE_M, len(xyz))
+    return _end_at(xyz, intensity, near, (rng.random(len(xyz)) < share) & (near < distance))
+
+
+def add_spray(xyz: np.ndarray, intensity: np.ndarray, num_plumes: float, rng: np.random.Generator) -> Points:
+    """Puts clouds of drops on the road, as wheels throw them up where it is wet.
+
+    Args:
+      xyz: (n, 3) m.
+      intensity: (n,).
+      num_plumes: how many; 0 is none.
+      rng: draws where, in a ring of `PLUME_RANGES_M`, which beams return from inside, and where on their way
+        through.
+
+    Returns:
+      As many points; those of drops have intensity 0.
+    """
+    for _ in range(int(num_plumes)):
+        angle, rho = rng.uniform(0, math.tau), rng.uniform(*PLUME_RANGES_M)
+        center = np.array([rho * math.cos(angle), rho * math.sin(angle), PLUME_Z_M])
+        distance = np.maximum(np.linalg.norm(xyz, axis=1), np.finfo(np.float32).tiny)
+        along = xyz @ center / distance
+        half_sq = PLUME_RADIUS_M**2 - (center @ center - along**2)
+        half = np.sqrt(np.maximum(half_sq, 0))
+        near = along + rng.uniform(-1, 1, len(xyz)) * half
+        inside = (half_sq > 0) & (near > MIN_RANGE_M) & (near < distance)
+        xyz, intensity = _end_at(xyz, intensity, near, inside & (rng.random(len(xyz)) < PLUME_SHARE))
+    return xyz, intensity
+
+
+def _end_at(xyz: np.ndarray, intensity: np.ndarray, range_m: np.ndarray, early: np.ndarray) -> Points:
+    """Some beams end at another range, with intensity 0."""
+    distance = np.maximum(np.linalg.norm(xyz, axis=1), np.finfo(np.float32).tiny)
+    scale = np.where(early, range_m / distance, 1)
+    return (xyz * scale[:, None]).astype(np.float32), np.where(early, 0, intensity).astype(np.float32)
 
 
 def reflect_below_road(
@@ -292,6 +391,13 @@ CORRUPTIONS: dict[str, Corruption] = {
     ),
     "fog": Corruption(
         title="fog", unit="m visibility", none=math.inf, amounts=(400, 200, 100, 50, 25), of_points=add_fog
+    ),
+    "rain": Corruption(title="rain", unit="mm/h", none=0, amounts=(0.5, 1, 5, 20, 50), of_points=add_rain),
+    "snow": Corruption(
+        title="snow", unit="share of beams", none=0, amounts=(0.01, 0.02, 0.05, 0.1, 0.2), of_points=add_snow
+    ),
+    "spray": Corruption(
+        title="spray", unit="plumes", none=0, amounts=(4, 8, 16, 32, 64), of_points=add_spray
     ),
     "clutter": Corruption(
         title="spurious returns",

@@ -85,6 +85,9 @@ from jaxbox.reference.ground import (
     spread_points,
     surface_height,
 )
+from jaxbox.reference.health import (
+    measure_health,
+)
 from jaxbox.reference.hull import (
     convex_hull,
     convex_hulls,
@@ -230,6 +233,7 @@ __all__ = [
     "list_hypotheses",
     "longer_side",
     "may_vote",
+    "measure_health",
     "min_area_rectangle",
     "neighbourhood_score",
     "non_max_suppression",

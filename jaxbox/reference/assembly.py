@@ -107,6 +107,7 @@ class Found(NamedTuple):
     completed: Completed
     candidates: list[Candidate]
     kept: Kept
+    health: dict[str, int]
 
 
 def assemble(
@@ -149,10 +150,14 @@ def assemble(
         vertical[:, 1],
         labels,
     )
-    counts = _count_points(found, config) | {
-        "ground_points": int(ground_mask.sum()),
-        "hull_vertices": max((len(hull) for hull in hulls), default=0),
-    }
+    counts = (
+        _count_points(found, config)
+        | found.health
+        | {
+            "ground_points": int(ground_mask.sum()),
+            "hull_vertices": max((len(hull) for hull in hulls), default=0),
+        }
+    )
     return ReferenceDetections(
         center=np.column_stack([boxes[:, :2], vertical[:, 0]]),
         size=np.column_stack([boxes[:, 2:4], vertical[:, 1]]),

@@ -13,6 +13,7 @@ from jaxbox.reference import (
     evidence,
     filtering,
     ground,
+    health,
     hull,
     scoring,
 )
@@ -74,6 +75,7 @@ def detect(
     owned, owner = assembly.assign_points(kept, obstacles, clusters)
     hulls = hull.convex_hulls(owned)
     num_points, described = shapes.describe(owned, hulls)
-    found = assembly.Found(sweep, terrain, obstacles, maps, clusters, completed, candidates, kept)
+    trust = health.measure_health(sweep, terrain, seen, config.health, config.ground)
+    found = assembly.Found(sweep, terrain, obstacles, maps, clusters, completed, candidates, kept, trust)
     first_return_m = evidence.first_returns(seen, config.evidence)
     return assembly.assemble(found, owner, hulls, num_points, described, first_return_m, config)

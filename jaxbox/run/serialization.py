@@ -32,6 +32,7 @@ CLASSES = (
     config.BoxConfig,
     config.CompletionConfig,
     config.VehicleConfig,
+    config.HealthConfig,
     config.DetectorConfig,
 )
 """Dataclasses whose static fields, if any, are numbers, strings and None."""

@@ -95,6 +95,31 @@ class GroundSummary:
         )
 
 
+@dataclasses.dataclass(frozen=True)
+class ReturnsSummary:
+    """What weather, a failing sensor or a wrong origin do to the returns, see `Counts`, `HealthConfig`."""
+
+    far_share: float
+    """Share of the finite points that are far, in [0, 1]; small in fog and rain."""
+    scattered_share: float
+    """Share of the directions in which a near return was seen through, in [0, 1]; large in snow and dust."""
+    rough_share: float
+    """Share of the ground's points near by that lie off it, in [0, 1]; large where ranges are noisy."""
+    points_under: int
+    """Ground points right under the origin; many where it is not the sensor's."""
+
+    @classmethod
+    def of(cls, counts: Counts, config: DetectorConfig) -> "ReturnsSummary":
+        """Those of one sweep; shares of nothing are 0."""
+        finite = counts.num_points - int(counts.dropped_points) - int(counts.nonfinite_points)
+        return cls(
+            far_share=int(counts.far_points) / max(finite, 1),
+            scattered_share=int(counts.scattered_azimuths) / config.evidence.num_azimuths,
+            rough_share=int(counts.rough_points) / max(int(counts.near_ground_points), 1),
+            points_under=int(counts.points_under),
+        )
+
+
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Summary:
     """What happened to one sweep, in numbers and words."""
@@ -125,6 +150,8 @@ class Summary:
     """Of their heights, m."""
     ground: GroundSummary
     """The ground plane."""
+    returns: ReturnsSummary
+    """By what the status doubts a sweep."""
 
     @property
     def dropped(self) -> dict[str, int]:
@@ -188,6 +215,7 @@ def summarise(
         width_m=Spread.of(size[:, 1]),
         height_m=Spread.of(size[:, 2]),
         ground=GroundSummary.of(detections.ground, config),
+        returns=ReturnsSummary.of(counts, config),
     )
 
 

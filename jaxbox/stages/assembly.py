@@ -7,12 +7,13 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxbox.config import DetectorConfig
+from jaxbox.config import DetectorConfig, HealthConfig
 from jaxbox.stages.state import (
     Candidates,
     Clusters,
     Completed,
     Ground,
+    Health,
     Kept,
     Obstacles,
     Outlines,
@@ -24,6 +25,7 @@ from jaxbox.types import (
     Counts,
     Descriptors,
     Detections,
+    GroundPlane,
     Hulls,
     PointCloud,
     Status,
@@ -87,6 +89,7 @@ class Found(NamedTuple):
     completed: Completed
     candidates: Candidates
     kept: Kept
+    health: Health
 
 
 def assemble(
@@ -172,7 +175,7 @@ def _count_points(found: Found, config: DetectorConfig) -> jax.Array:
 
 def _counts(points: jax.Array, cloud: PointCloud, found: Found, largest_hull: jax.Array) -> Counts:
     is_point, finite, in_region, inliers, ground, overhead, clustered = points
-    obstacles, clusters = found.obstacles, found.clusters
+    obstacles, clusters, health = found.obstacles, found.clusters, found.health
     num_obstacles = jnp.minimum(obstacles.count, obstacles.row.shape[0])
     return Counts(
         # Of a cloud that was made by hand, and says that it has fewer points than rows, none were dropped.
@@ -194,16 +197,50 @@ def _counts(points: jax.Array, cloud: PointCloud, found: Found, largest_hull: ja
         candidates=found.candidates.num,
         detections=found.kept.num,
         hull_vertices=largest_hull,
+        far_points=health.far_points,
+        scattered_azimuths=health.scattered_azimuths,
+        near_ground_points=health.near_ground_points,
+        rough_points=health.rough_points,
+        points_under=health.points_under,
     )
 
 
 def _status(cloud: PointCloud, counts: Counts, ground: Ground, config: DetectorConfig) -> jax.Array:
     in_region = counts.outlier_points + counts.ground_points + counts.overhead_points + counts.obstacles
+    found, plane = ground.plane.found, ground.plane
     bits = {
         Status.EMPTY: in_region == 0,
         Status.NONFINITE_POINTS: counts.nonfinite_points > 0,
         Status.POINT_OVERFLOW: counts.dropped_points > 0,
-        Status.NO_GROUND: ~ground.plane.found,
-        Status.GROUND_ABOVE: ground.plane.found & (ground.plane.coefficients[2] > GROUND_ABOVE_M),
+        Status.NO_GROUND: ~found,
+        Status.GROUND_ABOVE: found & (plane.coefficients[2] > GROUND_ABOVE_M),
+        Status.DEGRADED: found & _is_degraded(counts, in_region, config),
+        Status.DOUBTFUL_GROUND: found & _is_doubtful(plane, counts, in_region, config.health),
     } | counts.overflows(config, cloud.capacity)
     return combine_bits(bits)
+
+
+def _exceeds(part: jax.Array, share: jax.Array | float, whole: jax.Array | int) -> jax.Array:
+    """() bool: whether a count is a larger share of another."""
+    return part.astype(jnp.float32) > share * jnp.asarray(whole, jnp.float32)
+
+
+def _is_degraded(counts: Counts, in_region: jax.Array, config: DetectorConfig) -> jax.Array:
+    """() bool: whether the returns are those of bad weather or of a failing sensor."""
+    limits = config.health
+    # What exceeded the cloud's capacity was the farthest.
+    finite = in_region + counts.out_of_range_points + counts.dropped_points
+    near = finite - counts.far_points - counts.dropped_points
+    return (
+        _exceeds(near, 1 - limits.min_far_share, finite)
+        | _exceeds(counts.scattered_azimuths, limits.max_scattered_share, config.evidence.num_azimuths)
+        | _exceeds(counts.rough_points, limits.max_rough_share, counts.near_ground_points)
+    )
+
+
+def _is_doubtful(plane: GroundPlane, counts: Counts, in_region: jax.Array, limits: HealthConfig) -> jax.Array:
+    """() bool: whether no road lies so under a vehicle's sensor."""
+    a, b, c = plane.coefficients
+    steep = jnp.hypot(a, b) > jnp.tan(jnp.deg2rad(limits.max_tilt_deg))
+    under = _exceeds(counts.points_under, limits.max_under_share, in_region)
+    return (-c > limits.max_sensor_height_m) | steep | under

@@ -58,6 +58,23 @@ class Ground:
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
+class Health:
+    """What tells whether a sweep can be trusted, see the same fields of `jaxbox.types.Counts`."""
+
+    far_points: jax.Array
+    """() int32."""
+    scattered_azimuths: jax.Array
+    """() int32."""
+    near_ground_points: jax.Array
+    """() int32."""
+    rough_points: jax.Array
+    """() int32."""
+    points_under: jax.Array
+    """() int32."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
 class Obstacles:
     """The points above the ground, compacted."""
 

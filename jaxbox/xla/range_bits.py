@@ -186,3 +186,19 @@ def words_at(tables: Sequence[jax.Array], cells: Sequence[jax.Array], column: ja
     cells = materialize(tuple(cells))
     places = materialize([(cell >> BLOCK_BITS) * tables[0].shape[1] + column for cell in cells])
     return [lookup(table.reshape(-1), place) for table, place in zip(tables, places, strict=True)]
+
+
+def shared_cells(words: jax.Array, others: jax.Array) -> jax.Array:
+    """How many cells of a block are set in both. Law: ``count_bits`` of the low halves, bit by bit.
+
+    Args:
+      words: (...) uint32, of `covered_words` or `next_words`.
+      others: (...) uint32, likewise.
+
+    Returns:
+      (...) int32.
+
+    >>> shared_cells(jnp.uint32(0b0110), jnp.uint32(0x10000 | 0b1100)).item()
+    1
+    """
+    return count_bits(words & others & jnp.uint32(2**BLOCK - 1))

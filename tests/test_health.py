@@ -1,0 +1,80 @@
+"""Whether the status doubts a sweep that weather, a failing sensor or a wrong origin spoils, and no other."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from jaxbox import DetectorConfig, PointCloud, Status, detect, summarise, synthetic
+from jaxbox.config import HealthConfig
+from jaxbox.evaluation.corruptions import CORRUPTIONS
+
+CAPACITY = 65_536
+DOUBTS = Status.DEGRADED | Status.DOUBTFUL_GROUND
+
+
+@pytest.fixture(scope="module")
+def street():
+    return synthetic.make_sweep(0, num_azimuths=900).xyz
+
+
+def answer(xyz, **limits):
+    config = dataclasses.replace(DetectorConfig(), health=HealthConfig(**limits))
+    return detect(PointCloud.from_numpy(xyz, capacity=CAPACITY), config)
+
+
+def doubts(xyz, **limits):
+    return Status(int(answer(xyz, **limits).status)) & DOUBTS
+
+
+def spoiled(xyz, kind, amount):
+    none = np.zeros(len(xyz), np.float32)
+    of_points = CORRUPTIONS[kind].of_points
+    assert of_points is not None
+    return of_points(xyz, none, amount, np.random.default_rng(0))[0]
+
+
+def test_a_clear_sweep_is_not_doubted(street):
+    assert doubts(street) == Status.OK
+
+
+@pytest.mark.parametrize(
+    ("kind", "amount", "off"),
+    [
+        ("fog", 50, {"min_far_share": 0.0}),
+        ("rain", 20, {"min_far_share": 0.0, "max_rough_share": 1.0}),
+        ("snow", 0.1, {"max_scattered_share": 1.0}),
+        ("clutter", 0.1, {"max_scattered_share": 1.0}),
+        ("noise", 0.3, {"max_scattered_share": 1.0, "max_rough_share": 1.0}),
+    ],
+)
+def test_weather_and_noise_degrade_a_sweep_by_the_limit_that_is_meant_for_them(street, kind, amount, off):
+    xyz = spoiled(street, kind, amount)
+    assert doubts(xyz) == Status.DEGRADED
+    assert doubts(xyz, **off) == Status.OK
+
+
+TILT = np.array([[np.cos(0.14), 0, np.sin(0.14)], [0, 1, 0], [-np.sin(0.14), 0, np.cos(0.14)]])
+
+
+@pytest.mark.parametrize(
+    ("move", "off"),
+    [
+        (lambda xyz: xyz - [0, 0, 4], {"max_sensor_height_m": 9.0}),
+        (lambda xyz: xyz @ TILT, {"max_tilt_deg": 11.0}),
+        (lambda xyz: xyz + np.array([10, 0, 0]), {"max_under_share": 1.0}),
+    ],
+)
+def test_ground_that_lies_where_no_road_does_is_doubted(street, move, off):
+    xyz = move(street).astype(np.float32)
+    assert doubts(xyz) == Status.DOUBTFUL_GROUND
+    assert doubts(xyz, **off) == Status.OK
+
+
+def test_the_summary_has_the_figures_that_the_limits_are_for(street):
+    clear, snow = (summarise(answer(xyz)).returns for xyz in (street, spoiled(street, "snow", 0.1)))
+    rho = np.hypot(*street[:, :2].T)
+    assert clear.far_share == pytest.approx((rho > HealthConfig().far_m).mean(), abs=1e-6)
+    assert clear.scattered_share < HealthConfig().max_scattered_share < snow.scattered_share
+    assert 0 < clear.rough_share < HealthConfig().max_rough_share
+    assert clear.points_under == 0
