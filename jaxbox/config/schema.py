@@ -183,7 +183,7 @@ class EvidenceConfig:
     """static: range cells of the polar grid."""
     range_cell_m: float = _static(default=0.25)
     """static: length of a range cell."""
-    min_range_m: Scalar = 2.0
+    min_range_m: Scalar = 1.25
     """Nearer returns are the ego vehicle."""
     hit_min_height_m: Scalar = 0.3
     """A return between these heights is a hit."""
