@@ -230,7 +230,7 @@ def assemble(
     hulls, area = hull.trace_owned(owners, obstacles.xy, kept, config.hull)
     num_points, shapes = descriptors.describe(owners, obstacles.xy, kept, hulls, area)
     facing = fronts.find_fronts(owners, obstacles, kept)
-    trust = health.measure(sweep, terrain, segments.evidence, config.health, config.ground)
+    trust = health.measure_health(sweep, terrain, segments.evidence, config.health, config.ground)
     found = assembly.Found(sweep, terrain, obstacles, clusters, outlines, completed, candidates, kept, trust)
     first_return_m = evidence.first_returns(segments.evidence, config.evidence)
     return assembly.assemble(cloud, found, owners, hulls, num_points, shapes, facing, first_return_m, config)

@@ -424,15 +424,20 @@ def test_one_beam_to_the_ground_frees_the_cells_where_it_is_between_the_heights(
     assert evidence.hit_sums.max() == 0
 
 
-def test_over_a_dip_a_beam_is_as_high_as_over_its_bottom():
+def test_over_a_dip_a_beam_is_as_high_as_over_its_bottom_and_over_a_hill_as_on_even_ground():
     # The road falls by 1 m between 10 and 20 m, where the beam would be between the heights, and rises again.
     def dip(xyz):
         return -SENSOR_HEIGHT_M - ((xyz[:, 0] > 10) & (xyz[:, 0] < 20))
 
     xyz = np.array([[20.1, 0.0, -SENSOR_HEIGHT_M]])
-    for ground, is_free in ((even_ground, True), (dip, False)):
-        evidence = reference.build_evidence(xyz, np.zeros(1), SENSOR_HEIGHT_M, ground, EVIDENCE)
-        assert np.any(evidence.free_sums) == is_free
+    free = [
+        reference.build_evidence(xyz, np.zeros(1), SENSOR_HEIGHT_M, ground, EVIDENCE).free_sums
+        for ground in (even_ground, dip, lambda xyz: even_ground(xyz) + 1)
+    ]
+    assert np.any(free[0])
+    assert not np.any(free[1])
+    # A hill, which may be an obstacle taken for ground, does not bring the free space nearer.
+    np.testing.assert_array_equal(free[2], free[0])
 
 
 def test_a_beam_that_ends_between_the_heights_is_free_up_to_the_gap_and_hits():

@@ -68,7 +68,7 @@ def build_evidence(
 
     Over even ground, a beam to a return at range rho and height h is at height hs + t (h - hs) at range
     t rho, where hs is the sensor's height. The space below it is free where that is between the free heights.
-    Over other ground its height is measured at one place, in the middle of those.
+    Over lower ground its height is measured at one place, in the middle of those.
 
     Args:
       xyz: (n, 3) finite, m, sensor frame: all returns, ground included.
@@ -148,6 +148,7 @@ def _free_interval(
     half_way = np.clip((np.mean(heights) - sensor_height_m) / descent, 0.0, 1.0)
     there = half_way[:, None] * xyz
     above_even = there[:, 2] - ground_elevation(there) - (sensor_height_m + half_way * descent)
+    above_even = np.maximum(above_even, 0.0)
     leaves, enters = ((h - above_even - sensor_height_m) / descent for h in heights)
     enters, leaves = np.maximum(enters, 0.0), np.minimum(leaves, 1.0)
     rho = np.hypot(xyz[:, 0], xyz[:, 1])

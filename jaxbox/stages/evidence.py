@@ -85,8 +85,8 @@ def build_evidence(
 
     Over even ground, a beam from the sensor at height s to a return at range rho and height h < s is at
     height s + t (h - s) at the fraction t of its way. Where that lies between the two free heights, no
-    vehicle stands. Where the ground rises or falls on the way, the height is measured in the middle of that
-    part, and what it is more than this is added.
+    vehicle stands. Where the ground falls on the way, the height is measured in the middle of that part, and
+    what it is more than this is added.
 
     Args:
       xyz: (N, 3) float32, m, sensor frame.
@@ -114,6 +114,8 @@ def build_evidence(
     middle = jnp.clip((middle_height_m - sensor_height_m) / drop, 0, 1)
     place = middle[:, None] * xyz
     rise = place[:, 2] - ground_elevation(place) - (sensor_height_m + middle * drop)
+    # A beam that only seems low, where the ground is a guess, must not show free space nearer by.
+    rise = jnp.maximum(rise, 0)
     enter = jnp.maximum((config.free_max_height_m - rise - sensor_height_m) / drop, 0)
     leave = jnp.minimum((config.free_min_height_m - rise - sensor_height_m) / drop, 1)
     first_m = rho * enter

@@ -22,7 +22,7 @@ UNDER_RATIO = 0.6
 """Nearer than this share of its height no vehicle's sensor sees the road: that is 59 degrees below level."""
 
 
-def measure(
+def measure_health(
     sweep: Sweep, ground: Ground, evidence: Evidence | None, config: HealthConfig, ground_config: GroundConfig
 ) -> Health:
     """Counts what good sweeps have much of, or nothing.
