@@ -214,9 +214,8 @@ def is_behind(xy: np.ndarray, box: np.ndarray, behind_m: Scalar) -> np.ndarray:
     >>> is_behind(np.array([[12.4, 0.9], [7.6, 0.0]]), np.array([10.0, 0, 4, 2, 0]), 0.1).tolist()
     [True, False]
     """
-    x, y, length, width, yaw = box
-    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    local, sensor = (xy - [x, y]) @ turn, np.array([-x, -y]) @ turn
+    length, width = box[2:4]
+    local, sensor = _in_box_frame(xy, box), _in_box_frame(np.zeros(2), box)
     sees = np.abs(sensor) > [length / 2, width / 2]
     toward = local * np.sign(sensor)
     beyond = sees & (toward < [-length / 2 - behind_m, -width / 2 - behind_m])
@@ -235,14 +234,18 @@ def depth_behind_faces(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
     Returns:
       (n,) m; infinite where the sensor is inside the box.
     """
-    x, y, length, width, yaw = box
-    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    local, sensor = (xy - [x, y]) @ turn, np.array([-x, -y]) @ turn
+    local, sensor = _in_box_frame(xy, box), _in_box_frame(np.zeros(2), box)
     depth = np.full(len(xy), np.inf)
-    for axis, half in enumerate((length / 2, width / 2)):
+    for axis, half in enumerate((box[2] / 2, box[3] / 2)):
         if abs(sensor[axis]) > half:
             depth = np.minimum(depth, half - np.sign(sensor[axis]) * local[:, axis])
     return depth
+
+
+def _in_box_frame(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """(..., 2) m: along and across the box, from its centre."""
+    cos, sin = np.cos(box[4]), np.sin(box[4])
+    return (xy - box[:2]) @ np.array([[cos, -sin], [sin, cos]])
 
 
 def score_box(
