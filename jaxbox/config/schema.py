@@ -363,7 +363,7 @@ class HealthConfig:
     """With a smaller share of far points the sweep is `DEGRADED`; 0 for sweeps that are cut off nearer."""
     max_scattered_share: Scalar = 0.2
     """So it is with a larger share of directions in which a return within 4 m is seen through."""
-    max_rough_share: Scalar = 0.72
+    max_rough_share: Scalar = 0.78
     """So it is with a larger share of the ground's points near by that lie 5 cm or more off its surface."""
     max_sensor_height_m: Scalar = 4.5
     """Ground farther below the origin is doubtful."""
