@@ -248,9 +248,15 @@ def same_boxes(one, other):
 
 def test_a_session_counts_what_it_compiles_and_asks_nothing_twice(folder, frame, monkeypatch):
     # A detector that compiles in no time, by the same rules: shapes and static settings.
-    quick = jax.jit(lambda cloud, config: cloud.num_points + jnp.int32(config.clustering.min_points))
+    traces = []
+
+    @jax.jit
+    def quick(cloud, config):
+        traces.append(cloud)
+        return cloud.num_points + jnp.int32(config.clustering.min_points)
+
     monkeypatch.setattr("jaxbox.viewer.session.detect", quick)
-    monkeypatch.setattr("jaxbox.viewer.session.count_compilations", quick._cache_size)
+    monkeypatch.setattr("jaxbox.viewer.session.count_compilations", lambda: len(traces))
     session = Session(Frames(io.open_sweeps(folder)))
     assert not session.is_compiled(frame, DetectorConfig())
     shown = session.detect(frame, DetectorConfig())
