@@ -145,7 +145,7 @@ def test_what_cannot_be_used_is_refused_with_what_to_do(xyz, cluster, monkeypatc
     for call in (jaxbox.remove_ground, jaxbox.cluster_points, jaxbox.fit_boxes):
         with pytest.raises(ValueError, match=r"\(n, 3\)"):
             call(xyz[:, :2])
-        with pytest.raises(ValueError, match="no preset"):
+        with pytest.raises(ValueError, match="is not a preset"):
             call(xyz, config="papr")
         with pytest.raises(TypeError, match="PointCloud there"):
             jax.jit(call)(xyz)

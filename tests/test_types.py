@@ -160,7 +160,7 @@ def test_clouds_of_different_capacity_or_none_are_no_batch():
 
 def test_each_status_bit_is_a_bit_of_its_own_and_has_a_sentence():
     bits = [bit for bit in Status if bit]
-    assert len({int(bit) for bit in bits}) == len(bits) == 12
+    assert len({int(bit) for bit in bits}) == len(bits) == 14
     assert all(int(bit).bit_count() == 1 for bit in bits)
     for bit in bits:
         (text,) = bit.describe()

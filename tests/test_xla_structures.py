@@ -215,6 +215,20 @@ def test_covered_words_tell_which_cells_intervals_cover_and_how_many_before(num_
 
 
 @pytest.mark.usefixtures("platform")
+def test_shared_cells_are_those_that_are_set_in_both():
+    flags = np.random.default_rng(0).random((2, 3, range_bits.BLOCK, 5)) < 0.5
+    hits, beams = flags[0], flags[1].astype(np.int32)
+    shared = jax.jit(
+        lambda hits, beams: range_bits.shared_cells(
+            range_bits.next_words(hits), range_bits.covered_words(beams)
+        )
+    )(hits, beams)
+    # A cell is covered where as many beams as before it have begun and not ended.
+    covered = beams.reshape(-1, 5).cumsum(axis=0).reshape(beams.shape) > 0
+    np.testing.assert_array_equal(shared, (hits & covered).sum(axis=1))
+
+
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize(("num_blocks", "num_columns"), [(1, 1), (3, 5), (13, 2)])
 def test_next_set_is_the_first_flag_at_a_cell_or_beyond(num_blocks, num_columns):
     size = num_blocks * range_bits.BLOCK

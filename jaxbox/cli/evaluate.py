@@ -102,7 +102,7 @@ def print_report(report: Mapping[str, Any], console: Console) -> None:
     console.print(bin_table("LiDAR points", everything["by_points"]))
     console.print(size_table(report["selections"][SIZE_SELECTION]["matched"]))
     console.print(pose_table(report["selections"]))
-    console.print(precision_table(report["kitti"]["curves"], PRECISION_TITLE))
+    console.print(precision_table(report["kitti"]["curves"]))
     console.print(precision_table(report["vehicles"], VEHICLES_TITLE))
     if report["kitti"]["by_drive"]:
         console.print(drive_table(report["kitti"]["by_drive"]))
@@ -189,7 +189,7 @@ def _size_row(name: str, errors: Mapping[str, Any]) -> list[str]:
     return [name, *(_number(errors[key], digits) for key, digits in keys)]
 
 
-def precision_table(curves: Iterable[Mapping[str, Any]], title: str) -> Table:
+def precision_table(curves: Iterable[Mapping[str, Any]], title: str = PRECISION_TITLE) -> Table:
     """KITTI's average precision over 40 recalls, and the most that perfect boxes reach on these sweeps."""
     grouped: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
     for curve in curves:
