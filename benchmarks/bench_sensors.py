@@ -115,8 +115,7 @@ def measure(sweep: LabelledSweep, found: Detections) -> dict[str, Any]:
     boxes = sweep.boxes
     valid = np.asarray(found.valid)
     score = np.asarray(found.score)[valid]
-    center, size, yaw = (np.asarray(part)[valid] for part in (found.center, found.size, found.yaw))
-    overlap, _ = pairwise_overlaps(_rows(boxes.center, boxes.size, boxes.yaw), _rows(center, size, yaw))
+    overlap, _ = pairwise_overlaps(common.box_rows(boxes), common.box_rows(found)[valid])
     num_points = count_points_in_boxes(sweep.xyz, boxes.center, boxes.size, boxes.yaw)
     wanted = (num_points >= MIN_POINTS) & (np.hypot(*boxes.center[:, :2].T) <= MAX_RANGE_M)
     wanted &= ~_repeated(boxes)
@@ -148,13 +147,9 @@ def _detections(found: Detections, judged: np.ndarray, best: np.ndarray, right: 
 
 def _repeated(boxes: LabelledBoxes) -> np.ndarray:
     """(n,) bool: labels that an earlier one covers; some objects are labelled twice, as two tracks."""
-    rows = _rows(boxes.center, boxes.size, boxes.yaw)
+    rows = common.box_rows(boxes)
     overlap, _ = pairwise_overlaps(rows, rows)
     return np.any(np.tril(overlap, k=-1) >= REPEATED_OVERLAP, axis=1)
-
-
-def _rows(center: np.ndarray, size: np.ndarray, yaw: np.ndarray) -> np.ndarray:
-    return np.column_stack([center, size, yaw]).astype(float)
 
 
 def _labels_found(overlap: np.ndarray, score: np.ndarray, wanted: np.ndarray) -> dict[str, Any]:

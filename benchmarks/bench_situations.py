@@ -32,7 +32,7 @@ COLUMNS = "vehicles", "found", "loud", "silent", "false"
 def count(truth: TruthBoxes, detections: Detections) -> dict[str, int]:
     """The columns of the table, of one sweep."""
     boxes = detections.on_host().above(DEFAULT_SCORE_THRESHOLD)
-    overlap, _ = pairwise_overlaps(rows_of(truth), rows_of(boxes))
+    overlap, _ = pairwise_overlaps(common.box_rows(truth), common.box_rows(boxes))
     is_match = overlap >= MIN_OVERLAP
     is_found, is_seen = is_match.any(axis=1), truth.num_points >= MIN_POINTS
     missed, is_loud = int((is_seen & ~is_found).sum()), int(detections.status) != 0
@@ -43,11 +43,6 @@ def count(truth: TruthBoxes, detections: Detections) -> dict[str, int]:
         "silent": 0 if is_loud else missed,
         "false": int((~is_match.any(axis=0)).sum()),
     }
-
-
-def rows_of(boxes: TruthBoxes | Detections) -> np.ndarray:
-    """(n, 7) x, y, z, length, width, height, yaw."""
-    return np.column_stack([np.asarray(part) for part in (boxes.center, boxes.size, boxes.yaw)])
 
 
 def measure(

@@ -56,7 +56,7 @@ def changed(sweep: Sweep, change: str, draw: int) -> np.ndarray:
 def rows_of(found: Detections | Tracks) -> np.ndarray:
     """(n, 9) centre, size, yaw, score and class of the boxes at or above the threshold."""
     found = found.above(DEFAULT_SCORE_THRESHOLD)
-    return np.column_stack([found.center, found.size, found.yaw, found.score, found.label]).astype(float)
+    return np.column_stack([common.box_rows(found), found.score, found.label])
 
 
 def judge(before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

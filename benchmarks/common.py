@@ -170,6 +170,11 @@ def write_report(report: dict[str, Any], options: argparse.Namespace) -> None:
             json.dump(report | {"circumstances": circumstances(options)}, handle, indent=1)
 
 
+def box_rows(boxes: Any) -> np.ndarray:
+    """(n, 7) float64 x, y, z, length, width, height, yaw of boxes with `center`, `size` and `yaw`."""
+    return np.column_stack([boxes.center, boxes.size, boxes.yaw]).astype(float)
+
+
 def print_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
     """Prints aligned columns; floats with three significant decimals at most."""
     texts = [[_cell(value) for value in row] for row in [header, *rows]]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import bench_situations
+from benchmarks import bench_situations, common
 from jaxbox import DetectorConfig, PointCloud, Status, detect
 from jaxbox.evaluation.iou import pairwise_overlaps
 from jaxbox.synthetic import TruthBoxes
@@ -33,7 +33,7 @@ IN_SHORT = {
 @pytest.mark.parametrize("situation", SITUATIONS, ids=lambda situation: situation.title)
 def test_vehicles_of_a_situation_stand_apart_and_hold_their_points(situation):
     for xyz, truth in situation.sweeps(num_azimuths=200):
-        rows = bench_situations.rows_of(truth)
+        rows = common.box_rows(truth)
         overlap, _ = pairwise_overlaps(rows, rows)
         np.testing.assert_allclose(overlap, np.eye(len(rows)), atol=1e-6)
         c, s = np.cos(truth.yaw), np.sin(truth.yaw)
