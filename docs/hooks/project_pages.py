@@ -1,21 +1,25 @@
 """MkDocs hook: the project's own Markdown files as pages of the documentation."""
 
+import importlib
 import pathlib
 import re
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from mkdocs.structure.files import File, Files
+if TYPE_CHECKING:
+    from mkdocs.structure.files import Files
 
 PROJECT = pathlib.Path(__file__).parents[2]
 PAGES = {"CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 """Pages by the file that they are made of."""
 
 
-def on_files(files: Files, *, config: Any) -> Files:
+def on_files(files: "Files", *, config: Any) -> "Files":
     """Called by MkDocs with the files of the documentation."""
+    # Imported here, as a test of the pages runs where MkDocs is not installed.
+    file: Any = importlib.import_module("mkdocs.structure.files").File
     for source, page in PAGES.items():
         text = (PROJECT / source).read_text("utf-8")
-        files.append(File.generated(config, page, content=with_links_of_the_site(text)))
+        files.append(file.generated(config, page, content=with_links_of_the_site(text)))
     return files
 
 
