@@ -225,6 +225,47 @@ def test_eval_says_which_result_is_missing_and_can_take_it_for_empty(kitti_folde
     assert "1 without results" in taken.stdout
 
 
+def test_eval_of_a_protocol_detects_evaluates_and_goes_on_where_it_ended(kitti_folder, detected, tmp_path):
+    results = tmp_path / "results"
+    arguments = ("eval", "--protocol", "kitti-val", "--labels", kitti_folder, "--results", results)
+    first = run(*arguments)
+    assert first.exit_code == 0, first.output
+    # Of the two sweeps there, the protocol lists the second.
+    assert [path.name for path in results.glob("0*.txt")] == ["000001.txt"]
+    assert (results / "000001.txt").read_bytes() == (detected[0] / "000001.txt").read_bytes()
+    table = (results / "kitti-val.md").read_text()
+    assert "only 1 of 3,769 frames" in table
+    assert table in first.stdout
+    rows = [line.split("|")[1].strip() for line in table.splitlines() if line.startswith("|")]
+    assert rows[2:] == [
+        *(f"Car, {name}, 0.7" for name in ("2D box", "orientation", "bird's-eye view", "3D")),
+        *(f"Vehicle, {name}, 0.5" for name in ("bird's-eye view", "3D")),
+    ]
+    again = run(*arguments)
+    assert again.exit_code == 0, again.output
+    assert "0 sweeps done, 0 failed, 1 done before" in again.stdout
+    assert (results / "kitti-val.md").read_text() == table
+    other = run(*arguments, "--set", "vehicles.min_score=0.2")
+    assert other.exit_code == 2
+    assert "vehicles.min_score" in other.stderr
+
+
+def test_eval_of_a_protocol_refuses_what_it_cannot_use(kitti_folder, tmp_path):
+    without = tmp_path / "velodyne"
+    without.mkdir()
+    shutil.copy(kitti_folder / "velodyne" / "000000.bin", without)
+    arguments = ("eval", "--labels", without, "--results", tmp_path / "out")
+    for words, sentence in (
+        (("--protocol", "kitti-val"), "none of the 3,769 frames of kitti-val"),
+        (("--protocol", "kitti-val", "--tracking"), "--tracking: leave it out"),
+        (("--jobs", "2"), "--jobs: it detects nothing"),
+    ):
+        result = run(*arguments, *words)
+        assert result.exit_code == 2
+        assert sentence in result.stderr
+        assert not (tmp_path / "out").exists()
+
+
 def test_eval_with_drives_has_a_row_a_drive(kitti_folder, detected, tmp_path):
     drives = tmp_path / "drives.txt"
     drives.write_text("000000 first_street\n000001 second_street\n")

@@ -1,6 +1,7 @@
 """KITTI's protocol: against the official evaluator's own output, and rule by rule on cases worked by hand."""
 
 import dataclasses
+import hashlib
 import json
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from kitti_objects import car
 
 from jaxbox.evaluation import boxes, kitti
+from jaxbox.evaluation.protocols import Protocol, protocol_frames
 from jaxbox.io import KittiObject, read_label_folder
 
 OFFICIAL_METRICS = {
@@ -395,3 +397,10 @@ def test_camera_boxes_look_forward_left_up():
     np.testing.assert_allclose(box, [20, -2, 0.75 - 1.7, 3.9, 1.6, 1.5, -np.pi / 2])
     assert boxes.camera_boxes([]).shape == (0, 7)
     np.testing.assert_array_equal(boxes.camera_boxes([region(0, 0, 1, 1)])[0, 3:6], 0)
+
+
+def test_the_validation_frames_are_those_that_were_copied_and_checked():
+    # Against the training frames of the same split: none is in both, and together they are all 7,481.
+    frames = protocol_frames(Protocol.KITTI_VAL)
+    digest = hashlib.sha256("\n".join(frames).encode()).hexdigest()
+    assert digest == "657ac4bcc1e156e5b106a4ca18e1f88e012787ea1d2b5d0adeea97fee903fa86"

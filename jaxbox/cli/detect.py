@@ -2,7 +2,7 @@
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 
 from rich.progress import Progress
 
@@ -36,7 +36,9 @@ class DetectOptions(RunOptions):
     """Whether pictures are drawn."""
 
 
-def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
+def run_detect(
+    paths: Sequence[str], options: DetectOptions, *, frames: Collection[str] | None = None
+) -> ExitCode:
     """Detects in every sweep of some paths; a broken one is reported and the others go on.
 
     Interrupted (Ctrl-C or SIGTERM), it closes its files, so that what is done is whole and can be resumed.
@@ -44,6 +46,7 @@ def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
     Args:
       paths: what `jaxbox.io.open_sweeps` takes.
       options: the command's options.
+      frames: names of the sweeps that are wanted; None for all.
 
     Returns:
       `ExitCode.INTERRUPTED`, or `FRAME_FAILED` where a sweep failed.
@@ -52,6 +55,8 @@ def run_detect(paths: Sequence[str], options: DetectOptions) -> ExitCode:
       InputError: where a path holds no sweeps, or the options cannot be used.
     """
     sweeps, account = prepare_run(paths, options)
+    if frames is not None:
+        sweeps = [sweep for sweep in sweeps if sweep.name in frames]
     run = RunReport(jobs=options.jobs)
     start = time.perf_counter()
     with Results(

@@ -1,15 +1,19 @@
 """Options of ``jaxbox eval``, of single sweeps and of tracks."""
 
 import pathlib
+from collections.abc import Mapping
 from typing import Annotated
 
 import typer
 
+from jaxbox.cli.config_options import chosen_config
 from jaxbox.cli.console import input_errors, stdout
+from jaxbox.cli.eval_protocol import ProtocolOptions, run_eval_protocol
 from jaxbox.cli.evaluate import run_eval
 from jaxbox.cli.evaluate_tracking import run_eval_tracking
-from jaxbox.cli.options import DrivesOption
+from jaxbox.cli.options import DrivesOption, PresetOption, SetOption, SettingsOption
 from jaxbox.cli.report import SHOWN_MIN_SCORE
+from jaxbox.evaluation.protocols import Protocol
 
 
 def evaluate(
@@ -49,17 +53,42 @@ def evaluate(
     missing_as_empty: Annotated[
         bool, typer.Option("--missing-as-empty", help="Take a missing result file for one without boxes.")
     ] = False,
+    protocol: Annotated[
+        Protocol | None,
+        typer.Option(
+            help="Detect in these frames of LABELS first, where RESULTS lacks them, and write a table to "
+            "paste: RESULTS/PROTOCOL.md.",
+        ),
+    ] = None,
+    preset: PresetOption = None,
+    settings: SettingsOption = None,
+    changes: SetOption = None,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="With --protocol: processes that detect, 1 unless given.")
+    ] = None,
 ) -> None:
     """Score results against labels: the paper's size errors, recall and precision, KITTI's AP.
 
     Pictures are RESULTS/pictures/NAME_eval.png and contact_sheet.png, all frames on one.
 
     With --tracking: HOTA, CLEAR and identity by KITTI's protocol, and of vehicles from above and in 3D.
+
+    With --protocol kitti-val: one command for all of it, on KITTI's usual 3,769 validation frames; the same
+    command goes on where it was interrupted.
     """
     _check_options(tracking=tracking, frames=frames, plots=plots, drives=drives, pictures=pictures)
     if not tracking and min_score is not None and not 0 <= min_score <= 1:
         raise typer.BadParameter(f"--min-score is {min_score:g}; scores of detections are from 0 to 1.")
+    of_detecting = {"--preset": preset, "--config": settings, "--set": changes, "--jobs": jobs}
+    of_results = {"--tracking": tracking, "--plots": plots, "--drives": drives, "--pictures": pictures}
+    of_results |= {"--json": json, "--missing-as-empty": missing_as_empty, "--min-score": min_score}
+    _refuse(of_detecting, unless=protocol is not None, why="it detects nothing; give it with --protocol")
+    _refuse(of_results, unless=protocol is None, why="leave it out with --protocol, and evaluate again then")
     with input_errors():
+        if protocol is not None:
+            config = chosen_config(preset, settings, changes or [])
+            options = ProtocolOptions(protocol=protocol, config=config, jobs=jobs or 1)
+            raise typer.Exit(run_eval_protocol(labels, results, options, stdout()))
         if tracking:
             run_eval_tracking(
                 labels,
@@ -99,3 +128,9 @@ def _check_options(
     for name, value in of_sweeps.items():
         if tracking and value:
             raise typer.BadParameter(f"{name} is for single sweeps; leave it out with --tracking.")
+
+
+def _refuse(given: Mapping[str, object], *, unless: bool, why: str) -> None:
+    for name, value in given.items():
+        if not unless and value not in (None, False):
+            raise typer.BadParameter(f"{name}: {why}.")

@@ -3,7 +3,7 @@
 import dataclasses
 import os
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -46,13 +46,18 @@ class LabelledResults:
 
 
 def read_folders(
-    root: str | os.PathLike[str], results: str | os.PathLike[str], *, missing_as_empty: bool = False
+    root: str | os.PathLike[str],
+    results: str | os.PathLike[str],
+    *,
+    frames: Collection[str] | None = None,
+    missing_as_empty: bool = False,
 ) -> LabelledResults:
     """Reads the labels of a folder of sweeps and a folder of KITTI result files for them.
 
     Args:
       root: what `jaxbox.io.open_sweeps` takes; sweeps without labels are skipped.
       results: folder of ``NAME.txt`` or ``data/NAME.txt``, one a labelled sweep.
+      frames: names of the sweeps that are read; None for all.
       missing_as_empty: take a missing result file for an empty one.
 
     Returns:
@@ -62,7 +67,9 @@ def read_folders(
       InputError: for a missing folder, no labelled sweep, a missing result file, or a bad line.
     """
     labelled = [
-        (sweep, objects) for sweep in open_sweeps(root) if (objects := sweep.read_labels()) is not None
+        (sweep, objects)
+        for sweep in open_sweeps(root)
+        if (frames is None or sweep.name in frames) and (objects := sweep.read_labels()) is not None
     ]
     if not labelled:
         raise InputError(f"{root}: no sweep there has labels; expected label_2 or label_02 next to velodyne.")
@@ -83,6 +90,7 @@ def evaluate_folders(
     selections: Mapping[str, matching.Selection] = SELECTIONS,
     match_overlap: float = MATCH_OVERLAP,
     drives: Mapping[str, str] | None = None,
+    frames: Collection[str] | None = None,
     missing_as_empty: bool = False,
 ) -> dict[str, Any]:
     """Measures a folder of KITTI result files against the labels of a folder of sweeps.
@@ -93,6 +101,7 @@ def evaluate_folders(
       selections: what counts, by name.
       match_overlap: bird's-eye IoU from which sizes and directions are compared.
       drives: the drive of each labelled sweep, by name, to report each by itself too.
+      frames: names of the sweeps that are measured; None for all.
       missing_as_empty: take a missing result file for an empty one.
 
     Returns:
@@ -101,7 +110,7 @@ def evaluate_folders(
     Raises:
       InputError: as `read_folders`.
     """
-    read = read_folders(root, results, missing_as_empty=missing_as_empty)
+    read = read_folders(root, results, frames=frames, missing_as_empty=missing_as_empty)
     counted = all(sweep.calibration_path is not None for sweep in read.sweeps)
     report = evaluate_objects(
         read.labels,
