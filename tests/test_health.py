@@ -8,6 +8,7 @@ import pytest
 from jaxbox import DetectorConfig, PointCloud, Status, detect, summarise, synthetic
 from jaxbox.config import HealthConfig
 from jaxbox.evaluation.corruptions import CORRUPTIONS
+from jaxbox.synthetic.situations import SITUATIONS
 
 CAPACITY = 65_536
 DOUBTS = Status.DEGRADED | Status.DOUBTFUL_GROUND
@@ -36,6 +37,13 @@ def spoiled(xyz, kind, amount):
 
 def test_a_clear_sweep_is_not_doubted(street):
     assert doubts(street) == Status.OK
+
+
+def test_a_low_sensor_sees_less_far_and_is_not_doubted_for_it():
+    [(xyz, _)] = next(s for s in SITUATIONS if s.name == "sensor 0.6 m high").sweeps(num_azimuths=900)
+    assert np.hypot(xyz[:, 0], xyz[:, 1]).max() < HealthConfig().far_m
+    assert doubts(xyz) == Status.OK
+    assert doubts(xyz, far_m=400.0) == Status.DEGRADED
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,7 @@
 """Settings for sensors of fewer and more beams, and which of them fits a sweep."""
 
 import dataclasses
-import importlib
 import json
-import pathlib
 
 import numpy as np
 import pytest
@@ -126,18 +124,6 @@ def test_info_advises_to_level_what_is_tilted_or_seen_from_the_ground(pitch_deg,
     info, _ = fits(xyz)
     assert info.tilt_deg == pytest.approx(pitch_deg, abs=0.2)
     assert sweep_info.advised_options([info], 64) == options
-
-
-def test_no_drive_is_both_chosen_on_and_held_out(monkeypatch):
-    monkeypatch.syspath_prepend(str(pathlib.Path(__file__).parents[1]))
-    bench = importlib.import_module("benchmarks.bench_beams")
-    lines = [line.split() for line in bench.DRIVES_FILE.read_text().splitlines() if line[0] != "#"]
-    drives = dict(lines)
-    chosen = bench.chosen_on(drives)
-    on = {drives[name] for name in drives if chosen[name]}
-    off = {drives[name] for name in drives if not chosen[name]}
-    assert not on & off
-    assert (len(on), len(off)) == (6, 6)
 
 
 def test_detect_sees_a_tilted_sweep_from_the_ground_upright(tmp_path):

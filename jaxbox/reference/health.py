@@ -13,6 +13,8 @@ GROUND_BAND_M = 0.3
 """Points at most so far from the ground are compared,"""
 ROUGH_M = 0.05
 """and are rough where they are farther than this."""
+USUAL_HEIGHT_M = 1.73
+"""A sensor lower than this sees less far: what is far is nearer in proportion."""
 UNDER_RATIO = 0.6
 """Ground nearer than this share of the sensor's height is right under it."""
 
@@ -40,6 +42,7 @@ def measure_health(
     near &= ground.surface is not None
     sensor_height_m = -ground.planes[0, 2]
     under = (off_ground < ground_config.min_height_m) & (rho < UNDER_RATIO * sensor_height_m)
+    far_m = config.far_m * np.clip(sensor_height_m / USUAL_HEIGHT_M, 0, 1)
     scattered = 0
     if evidence is not None:
         hit, free = (
@@ -47,7 +50,7 @@ def measure_health(
         )
         scattered = int(((hit > 0) & (free > 0)).any(axis=1).sum())
     return {
-        "far_points": int((sweep.finite & (~sweep.in_region | (rho > config.far_m))).sum()),
+        "far_points": int((sweep.finite & (~sweep.in_region | (rho > far_m))).sum()),
         "scattered_azimuths": scattered,
         "near_ground_points": int(near.sum()),
         "rough_points": int((near & (off_ground > ROUGH_M)).sum()),
