@@ -21,9 +21,11 @@ import numpy as np
 
 import jaxbox
 from benchmarks import bench_sensors, common
-from jaxbox import Detections, DetectorConfig, PointCloud
+from jaxbox import Detections, DetectorConfig, PointCloud, Tracks
 from jaxbox.evaluation import pairwise_overlaps
+from jaxbox.io import open_sweeps
 from jaxbox.run.processes import THREADS_VARIABLE
+from jaxbox.tracking.poses import PoseSource
 from quality.bad_input import PRESETS, street
 
 REPEATS, QUICK_REPEATS = 100, 10
@@ -35,6 +37,11 @@ SAME_OBJECT_OVERLAP = 0.1
 OFTEN = 0.9
 """An object is often there where that many of the keys find it."""
 TIMEOUT_S = 3600
+
+TRACKS = "tracks"
+"""What is asked of another process instead of a preset's answers."""
+TRACK_SET, TRACK_SWEEPS = "kitti_tracking", 40
+"""The drive that is tracked: its first sweeps."""
 
 NO_CACHE = {"JAXBOX_CACHE_DIR": "", "JAX_ENABLE_COMPILATION_CACHE": "false"}
 PROCESSES: Mapping[str, Mapping[str, str]] = {
@@ -64,7 +71,7 @@ class Given:
         return self.xyz, None
 
 
-def digest(detections: Detections) -> str:
+def digest(detections: Detections | Tracks) -> str:
     """Of every bit of an answer, with the shapes and types of its arrays."""
     code = hashlib.sha256()
     for leaf in jax.tree.leaves(jax.device_get(detections)):
@@ -151,8 +158,42 @@ def _print_digests(options: argparse.Namespace) -> None:
     if "ONE_CORE" in os.environ:
         # Before the first computation, when XLA counts the cores.
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    if options.digests_of == TRACKS:
+        print(json.dumps(track_digests(options)))
+        return
     config = common.chosen_config(options, preset=options.digests_of)
     print(json.dumps(digests(sweeps_to_compare(options.quick), config)))
+
+
+# Tracks.
+
+
+def track_digests(options: argparse.Namespace, *, workers: int = 1) -> list[str]:
+    """Of the tracks of each sweep of a drive, poses from the boxes."""
+    if options.quick:
+        sweeps: Sequence[Any] = sweeps_to_compare(options.quick)
+    else:
+        sweeps = open_sweeps(common.data_folder(TRACK_SET))[:TRACK_SWEEPS]
+    config = common.chosen_config(options, preset="default")
+    found = jaxbox.track(sweeps, config, poses=PoseSource.BOXES, workers=workers)
+    return [_tracked(result) for result in found]
+
+
+def _tracked(result: jaxbox.TrackedSweep) -> str:
+    if result.tracks is None:
+        raise SystemExit(f"{result.name}: {result.error}")
+    return digest(result.tracks)
+
+
+def compare_tracks(options: argparse.Namespace) -> dict[str, bool]:
+    """Whether the tracks of a drive are the same however they come about."""
+    expected = track_digests(options)
+    processes = dict(list(PROCESSES.items())[:1]) if options.quick else PROCESSES
+    return {
+        "again": track_digests(options) == expected,
+        "detected by 2 processes": track_digests(options, workers=2) == expected,
+        **{name: by_process(env, options, TRACKS) == expected for name, env in processes.items()},
+    }
 
 
 def compare(options: argparse.Namespace, preset: str) -> dict[str, Any]:
@@ -287,8 +328,9 @@ def _move_table(moves: Sequence[Mapping[str, np.ndarray]]) -> dict[str, dict[str
 def main(arguments: Sequence[str] | None = None) -> None:
     """Prints the tables and writes the report; ends with exit code 1 where bits differ that must not."""
     parser = common.parser(__doc__ or "", preset=False, quick="small synthetic sweeps, few repeats and keys")
-    parser.add_argument("--digests-of", choices=sorted(DetectorConfig.presets()), help=argparse.SUPPRESS)
-    parser.add_argument("--presets", nargs="+", choices=sorted(DetectorConfig.presets()), default=PRESETS)
+    presets = sorted(DetectorConfig.presets())
+    parser.add_argument("--digests-of", choices=[*presets, TRACKS], help=argparse.SUPPRESS)
+    parser.add_argument("--presets", nargs="+", choices=presets, default=PRESETS)
     parser.add_argument("--keys", type=int, help=f"random keys to try, {KEYS} by default")
     options: argparse.Namespace = parser.parse_args(arguments)
     if options.digests_of:
@@ -301,8 +343,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         config = common.chosen_config(options, preset=preset)
         report["keys"][preset] = spread_over_keys(sweeps_for_keys(options.quick), config, keys)
         _print(preset, report["same_bits"][preset], report["keys"][preset])
+    report["same_tracks"] = compare_tracks(options)
+    common.print_table(["same tracks", ""], list(report["same_tracks"].items()))
     common.write_report(report, options)
-    if any(_differs(same) for same in report["same_bits"].values()):
+    bits = report["same_bits"].values()
+    if any(_differs(same) for same in bits) or not all(report["same_tracks"].values()):
         sys.exit(1)
 
 

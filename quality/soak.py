@@ -2,8 +2,9 @@
 
     python -m quality.soak --json quality/results/soak.json
 
-Two runs in processes of their own: the real sweeps over and over, at one capacity; and sweeps of wildly
-varying size, from none to a million points, over all capacity buckets. After a warm-up, in which each
+Three runs in processes of their own: the real sweeps over and over, at one capacity; sweeps of wildly
+varying size, from none to a million points, over all capacity buckets; and drives over and over through the
+tracker, poses from the boxes. After a warm-up, in which each
 capacity compiles, the interval between results is the time of a frame. ``--quick`` takes 200 small synthetic
 frames, and two buckets.
 """
@@ -16,7 +17,7 @@ import itertools
 import multiprocessing
 import pathlib
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -28,11 +29,14 @@ from jaxbox import DetectorConfig
 from jaxbox._padding import CAPACITY_BUCKETS, fitting_capacity
 from jaxbox.io import open_sweeps
 from jaxbox.run import compiled
+from jaxbox.tracking.poses import PoseSource
 from quality.bad_input import street
 
 FRAMES, QUICK_FRAMES = 20_000, 200
 SIZE_FRAMES = 2_000
 """Frames of varying size, which take several times as long."""
+TRACK_SET = "kitti_tracking"
+"""Drives for the tracker."""
 MAX_POINTS, QUICK_MAX_POINTS = 1_000_000, 2 * CAPACITY_BUCKETS[0]
 CAPACITY = 2**17
 """Of the real sweeps, which have some 65,000 to 125,000 points."""
@@ -61,6 +65,22 @@ class Resized:
         rng = np.random.default_rng(self.seed)
         xyz = self.base[rng.integers(0, len(self.base), self.size)]
         return xyz + rng.normal(0, JITTER_M, xyz.shape).astype(np.float32), None
+
+
+@dataclasses.dataclass(frozen=True)
+class Untimed:
+    """A sweep of a drive that goes round in circles: its place says when it was taken."""
+
+    sweep: Any
+
+    @property
+    def name(self) -> str:
+        """Of the sweep."""
+        return self.sweep.name
+
+    def read_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """The points and their intensities."""
+        return self.sweep.read_points()
 
 
 def real_sweeps() -> list[Any]:
@@ -101,14 +121,17 @@ class CompileCounter:
 
 
 def soak(
-    sweeps: Iterable[Any], warm_up: Sequence[Any], config: DetectorConfig, capacity: int | None
+    sweeps: Iterable[Any],
+    warm_up: Sequence[Any],
+    config: DetectorConfig,
+    capacity: int | None,
+    *,
+    run: Callable[..., Iterable[jaxbox.StreamedSweep]] = jaxbox.stream,
 ) -> dict[str, Any]:
     """Streams sweeps, after some that compile whatever there is to compile."""
     counter = CompileCounter()
     # One device, so that the time between two results is that of one sweep.
-    stream = functools.partial(
-        jaxbox.stream, config=config, capacity=capacity, devices=jax.local_devices()[:1]
-    )
+    stream = functools.partial(run, config=config, capacity=capacity, devices=jax.local_devices()[:1])
     for result in stream([*warm_up] * 2):
         _check(result)
     warm_compiles, programs = counter.count, compiled.count_compilations()
@@ -188,6 +211,17 @@ def run_varied(options: argparse.Namespace) -> dict[str, Any]:
     return soak(sweeps, sweeps[: len(buckets)], config, None)
 
 
+def run_tracked(options: argparse.Namespace) -> dict[str, Any]:
+    """The detector and the tracker, on drives that follow each other."""
+    config = common.chosen_config(options)
+    track = functools.partial(jaxbox.track, poses=PoseSource.BOXES)
+    if options.quick:
+        sweeps = [Resized(f"street {seed}", street(seed), 15_000, seed) for seed in range(4)]
+        return soak(_cycle(sweeps, options.frames), sweeps, config, CAPACITY_BUCKETS[0], run=track)
+    sweeps = [Untimed(sweep) for sweep in open_sweeps(common.data_folder(TRACK_SET))]
+    return soak(_cycle(sweeps, options.frames), sweeps[:2], config, CAPACITY, run=track)
+
+
 def _cycle(sweeps: Sequence[Any], frames: int) -> Iterator[Any]:
     return itertools.islice(itertools.cycle(sweeps), frames)
 
@@ -195,13 +229,13 @@ def _cycle(sweeps: Sequence[Any], frames: int) -> Iterator[Any]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Prints the figures and writes the report."""
     parser = common.parser(__doc__ or "", quick=f"{QUICK_FRAMES} small synthetic frames, which need no data")
-    parser.add_argument("--frames", type=int, help=f"of the real sweeps, {FRAMES:,} by default")
+    parser.add_argument("--frames", type=int, help=f"of real sweeps and of drives, {FRAMES:,} by default")
     parser.add_argument("--size-frames", type=int, help=f"of varying size, {SIZE_FRAMES:,} by default")
     options: argparse.Namespace = parser.parse_args(arguments)
     options.frames = options.frames or (QUICK_FRAMES if options.quick else FRAMES)
     options.size_frames = options.size_frames or (QUICK_FRAMES if options.quick else SIZE_FRAMES)
     report = {}
-    for name, run in {"real": run_real, "varied": run_varied}.items():
+    for name, run in {"real": run_real, "varied": run_varied, "tracked": run_tracked}.items():
         # Of a process of its own, the peak is its own too.
         spawn = multiprocessing.get_context("spawn")
         with concurrent.futures.ProcessPoolExecutor(1, spawn) as pool:
@@ -211,7 +245,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def print_report(report: dict[str, Any]) -> None:
-    """The figures of both runs side by side."""
+    """The figures of the runs side by side."""
     names = [name for name, value in report["real"].items() if not isinstance(value, dict)]
     rows = [(name, *(report[run][name] for run in report)) for name in names]
     for name in report["real"]["frame_ms"]:

@@ -1,6 +1,7 @@
 """The same bits every time, other keys, and a soak: the short versions of both programs."""
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from test_detector import CAPACITY, found, run, street
 import jaxbox
 from jaxbox import DetectorConfig
 from jaxbox.run import compiled
+from jaxbox.tracking.poses import PoseSource
 from quality import determinism, soak
 
 BOX = np.array([10.0, 2, -1, 4, 1.8, 1.5, 0.1, 0.5])
@@ -70,6 +72,17 @@ def test_a_soak_of_small_sweeps_of_any_size_recompiles_nothing_and_loses_no_poin
     assert report["points"]["maximum"] == CAPACITY
     assert compiled.count_compilations() == programs
     assert 0 < report["frame_ms"]["p50"] <= report["frame_ms"]["p99.9"] <= report["frame_ms"]["max"]
+
+
+def test_tracks_of_a_drive_are_the_same_again_and_a_soak_of_them_recompiles_nothing():
+    options = determinism.common.parser("", preset=False, quick="small").parse_args(["--quick"])
+    first, again = (determinism.track_digests(options) for _ in range(2))
+    assert first == again
+    assert len(set(first)) == determinism.NUM_SWEEPS
+    sweeps = [soak.Untimed(sweep) for sweep in determinism.sweeps_to_compare(True)]
+    track = functools.partial(jaxbox.track, poses=PoseSource.BOXES)
+    report = soak.soak(sweeps * 20, sweeps, DetectorConfig(), CAPACITY, run=track)
+    assert (report["frames"], report["recompiles"]) == (20 * len(sweeps), 0)
 
 
 def test_a_soak_ends_where_a_sweep_fails_and_the_slope_is_that_of_the_memory():

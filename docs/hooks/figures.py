@@ -535,6 +535,10 @@ def same_bits() -> str:
     for group in ("same_in_batches", "same_in_processes", "same_in_other_programs"):
         for name in first[group]:
             rows.append((name, *("same bits" if both[preset][group][name] else "differs" for preset in both)))
+    rows += [
+        (f"tracks of a drive, {name}", "same bits" if same else "differs", *[""] * (len(both) - 1))
+        for name, same in report.get("same_tracks", {}).items()
+    ]
     return table(["", *both], rows) + made_with(report)
 
 
@@ -572,11 +576,11 @@ def moves() -> str:
 
 
 def soak() -> str:
-    """The figures of both runs of the soak."""
+    """The figures of the runs of the soak."""
     report = load("soak")
     first = "small synthetic sweeps" if report["circumstances"]["options"]["quick"] else "real sweeps"
-    runs = {first: report["real"], "any size": report["varied"]}
-    points = [f"{run['points']['least']:,} to {run['points']['most']:,}" for run in runs.values()]
+    runs = {first: report["real"], "any size": report["varied"], "drives, tracked": report["tracked"]}
+    points = [f"{run['points']['minimum']:,} to {run['points']['maximum']:,}" for run in runs.values()]
     rows: list[tuple[Any, ...]] = [
         ("frames", *(f"{run['frames']:,}" for run in runs.values())),
         ("points of a frame", *points),
