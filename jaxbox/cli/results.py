@@ -16,6 +16,7 @@ from jaxbox.cli.console import OutputError
 from jaxbox.config import DetectorConfig
 from jaxbox.config.fields import differing_names, recorded_options
 from jaxbox.geometry.mounting import Mounting
+from jaxbox.io.csv_table import CSV
 from jaxbox.io.jsonl import JSONL
 from jaxbox.io.mcap_results import MCAP_RESULTS
 from jaxbox.io.parquet import PARQUET
@@ -39,6 +40,7 @@ class ResultFormat(enum.StrEnum):
     JSONL = "jsonl"
     BOTH = "both"
     PARQUET = "parquet"
+    CSV = "csv"
     MCAP = "mcap"
     RERUN = "rerun"
 
@@ -46,6 +48,7 @@ class ResultFormat(enum.StrEnum):
 FILES: Mapping[ResultFormat, ResultFile] = {
     ResultFormat.JSONL: JSONL,
     ResultFormat.PARQUET: PARQUET,
+    ResultFormat.CSV: CSV,
     ResultFormat.MCAP: MCAP_RESULTS,
     ResultFormat.RERUN: RERUN,
 }

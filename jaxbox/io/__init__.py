@@ -37,7 +37,7 @@ from jaxbox.io.levelled import LevelSweeps, measure_sweeps
 from jaxbox.io.npy import read_npy, read_npz
 from jaxbox.io.nuscenes import read_nuscenes
 from jaxbox.io.pandaset import read_pandaset_boxes, read_pandaset_points
-from jaxbox.io.pcd import read_pcd
+from jaxbox.io.pcd import read_pcd, write_pcd
 from jaxbox.io.ply import read_ply
 from jaxbox.io.points import TimedPoints, read_bin, write_bin
 from jaxbox.io.pose_files import PoseFile, PoseFrame, read_pose_file
@@ -113,5 +113,6 @@ __all__ = [
     "write_config",
     "write_jsonl",
     "write_labels",
+    "write_pcd",
     "write_tracks",
 ]
