@@ -16,7 +16,7 @@ from jaxbox.xla import backend
 DATA = pathlib.Path(os.environ.get("JAXBOX_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
 
 FAST = {
-    "test_ablation.py", "test_capacities.py", "test_classes.py", "test_config.py",
+    "test_ablation.py", "test_annotations.py", "test_capacities.py", "test_classes.py", "test_config.py",
     "test_config_fields.py", "test_conventions.py", "test_docs.py", "test_evaluation_beams.py",
     "test_evaluation_corruptions.py", "test_evaluation_iou.py", "test_evaluation_kitti.py",
     "test_evaluation_objectives.py", "test_evaluation_report.py", "test_evaluation_sizes.py",

@@ -86,6 +86,7 @@ def test_every_sequence_has_every_file_and_the_account(written, kitti):
     output, result = written
     suffixes = ("txt", "jsonl", "parquet", "csv", "mcap", "rrd", "mp4", "gif")
     expected = {f"{sequence}.{suffix}" for sequence in LENGTHS for suffix in suffixes}
+    expected |= {f"{sequence}_{tool}" for sequence in LENGTHS for tool in ("cvat", "labelcloud", "xtreme1")}
     beside = {"config.toml", "run.json", "pictures", "crops", "contact_sheet.png"}
     assert {path.name for path in output.iterdir()} == expected | beside
     account = json.loads((output / "run.json").read_text())
@@ -151,6 +152,35 @@ def test_kitti_text_is_what_the_evaluation_reads(written, kitti, tmp_path):
     report = evaluate_tracking_folders(tmp_path, written[0])
     assert report["kitti"]["Car"]["hota"]["hota"] == pytest.approx(1)
     assert report["kitti"]["Car"]["clear"]["num_labels"] > 0
+
+
+def test_labels_for_annotation_tools_hold_the_seen_and_confirmed_tracks(written):
+    output, _ = written
+    shown = {}
+    for record in records_of(output):
+        boxes = [box for box in record["boxes"] if box["confirmed"] and box["sight"] == "seen"]
+        shown[record["name"]] = [box["id"] for box in boxes if box["score"] >= SHOWN_MIN_SCORE]
+    assert any(shown.values())
+    for tool in ("cvat", "xtreme1"):
+        sweeps = io.open_sweeps(output / f"0000_{tool}")
+        assert {s.name: [item.track_id for item in s.read_labels()] for s in sweeps} == shown
+    sweeps = io.open_sweeps(output / "0000_labelcloud")
+    assert {s.name: len(s.read_labels()) for s in sweeps} == {name: len(ids) for name, ids in shown.items()}
+
+
+def test_labels_of_a_tool_are_detected_in_and_evaluated(written, tmp_path):
+    labels = written[0] / "0000_labelcloud"
+    options = ("--output", tmp_path, "--no-pictures", "--capacity", CAPACITY)
+    assert run("detect", labels, *options).exit_code == 0
+    result = run("eval", "--labels", labels, "--results", tmp_path, "--json", tmp_path / "report.json")
+    assert result.exit_code == 0, result.output
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["num_frames"] == LENGTHS["0000"]
+    # What the tracker shows is what was detected, with a box that its sweeps agree on.
+    rate = report["selections"]["all"]["rates"][0]
+    assert rate["num_labels"] > 0
+    assert rate["recall"] > 0.8
+    assert "2D box" not in result.output
 
 
 def test_tables_hold_a_row_for_each_track_and_sweep(written):

@@ -253,7 +253,9 @@ app.command("eval", epilog=EXIT_CODES)(evaluate)
 @app.command(epilog=EXIT_CODES)
 def tune(
     *,
-    labels: Annotated[pathlib.Path, typer.Option(help="A labelled KITTI folder.")],
+    labels: Annotated[
+        pathlib.Path, typer.Option(help="A labelled KITTI folder, or that of an annotation tool.")
+    ],
     output: Annotated[pathlib.Path, typer.Option(help="Folder for the report and the best settings.")],
     search: Annotated[
         list[str] | None,

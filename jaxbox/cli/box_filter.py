@@ -1,4 +1,4 @@
-"""Which boxes a command writes and draws, by class and place: a look at the answer, which compiles nothing."""
+"""Which boxes a command writes and draws, by class and place: a look at the answer; nothing compiles."""
 
 import dataclasses
 import math

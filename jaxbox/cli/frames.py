@@ -6,7 +6,6 @@ import pathlib
 import time
 from collections.abc import Callable, Generator, Iterable
 
-import jax
 import numpy as np
 
 from jaxbox import io
@@ -16,7 +15,7 @@ from jaxbox.cli.run_sheet import TILE_FRAME
 from jaxbox.cli.timing import TimedDetector
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation.iou import image_fractions
-from jaxbox.geometry.projection import project_boxes
+from jaxbox.io.kitti import boxes_in_image
 from jaxbox.io.points import Points
 from jaxbox.run.processes import ProcessPool, ahead
 from jaxbox.types import Calibration, Detections, PointCloud
@@ -29,8 +28,6 @@ SHOWN_PICTURES = ("boxes", "lidar", "image")
 """Of the pictures of the stages, those that show the answer."""
 DONT_CARE_SHARE = 0.5
 """A box with a larger share of its 2D box in one DontCare region is not judged."""
-
-_project_boxes = jax.jit(project_boxes)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -245,9 +242,9 @@ def covered_by_labels(
     Returns:
       (K,) bool, padding included.
     """
-    projected = _project_boxes(detections.center, detections.size, detections.yaw, calibration)
-    boxes_px = np.asarray(projected.boxes_px, np.float64)
-    covered = np.asarray(projected.visible).copy()
+    boxes_px, _, covered = boxes_in_image(
+        np.asarray(detections.center), np.asarray(detections.size), np.asarray(detections.yaw), calibration
+    )
     for label in labels:
         if label.is_dont_care:
             covered &= (

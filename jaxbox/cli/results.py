@@ -16,6 +16,7 @@ from jaxbox.cli.console import OutputError
 from jaxbox.config import DetectorConfig
 from jaxbox.config.fields import differing_names, recorded_options
 from jaxbox.geometry.mounting import Mounting
+from jaxbox.io.annotation_results import CVAT, LABELCLOUD, XTREME1
 from jaxbox.io.csv_table import CSV
 from jaxbox.io.jsonl import JSONL
 from jaxbox.io.mcap_results import MCAP_RESULTS
@@ -43,6 +44,9 @@ class ResultFormat(enum.StrEnum):
     CSV = "csv"
     MCAP = "mcap"
     RERUN = "rerun"
+    CVAT = "cvat"
+    LABELCLOUD = "labelcloud"
+    XTREME1 = "xtreme1"
 
 
 FILES: Mapping[ResultFormat, ResultFile] = {
@@ -51,6 +55,9 @@ FILES: Mapping[ResultFormat, ResultFile] = {
     ResultFormat.CSV: CSV,
     ResultFormat.MCAP: MCAP_RESULTS,
     ResultFormat.RERUN: RERUN,
+    ResultFormat.CVAT: CVAT,
+    ResultFormat.LABELCLOUD: LABELCLOUD,
+    ResultFormat.XTREME1: XTREME1,
 }
 """Formats of one file a run; KITTI text is one a sweep."""
 

@@ -140,7 +140,7 @@ def _is_finished(
     """Whether an earlier run has done a whole sequence; `earlier` are those that it has not."""
     if earlier is None or name in earlier or len(sweeps) == 0:
         return False
-    return options.files_of(name).are_there(has_camera=sweeps[0].calibration_path is not None)
+    return options.files_of(name).are_there(has_camera=sweeps[0].is_calibrated)
 
 
 def _write_account(account: RunAccount, run: TrackReport, pending: Sequence[str]) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxbox.cli.inputs import PICTURE_FOLDER
 from jaxbox.cli.results import written
+from jaxbox.io.annotation_results import open_cvat, open_labelcloud, open_xtreme1
 from jaxbox.io.csv_table import open_csv
 from jaxbox.io.jsonl import open_jsonl
 from jaxbox.io.kitti_tracking import open_track_text
@@ -32,6 +33,9 @@ class TrackFormat(enum.StrEnum):
     CSV = "csv"
     MCAP = "mcap"
     RERUN = "rerun"
+    CVAT = "cvat"
+    LABELCLOUD = "labelcloud"
+    XTREME1 = "xtreme1"
 
 
 OpenResults = Callable[[pathlib.Path], contextlib.AbstractContextManager[WriteResult]]
@@ -41,15 +45,21 @@ class _Kind(NamedTuple):
     suffix: str
     open: OpenResults
     wants_points: bool = False
+    takes_coasting: bool = False
 
 
 _KINDS: Mapping[TrackFormat, _Kind] = {
-    TrackFormat.KITTI: _Kind(".txt", open_track_text),
+    TrackFormat.KITTI: _Kind(".txt", open_track_text, takes_coasting=True),
     TrackFormat.JSONL: _Kind(".jsonl", open_jsonl),
     TrackFormat.PARQUET: _Kind(".parquet", functools.partial(open_parquet, columns=TRACK_COLUMNS)),
     TrackFormat.CSV: _Kind(".csv", functools.partial(open_csv, columns=TRACK_COLUMNS)),
     TrackFormat.MCAP: _Kind(".mcap", open_mcap_results, wants_points=True),
     TrackFormat.RERUN: _Kind(".rrd", open_rerun, wants_points=True),
+    TrackFormat.CVAT: _Kind("_cvat", open_cvat, wants_points=True, takes_coasting=True),
+    TrackFormat.LABELCLOUD: _Kind("_labelcloud", open_labelcloud, wants_points=True, takes_coasting=True),
+    TrackFormat.XTREME1: _Kind(
+        "_xtreme1", functools.partial(open_xtreme1, scene=True), wants_points=True, takes_coasting=True
+    ),
 }
 VIDEO_SUFFIX, GIF_SUFFIX = ".mp4", ".gif"
 GIF_PICTURES = 100
@@ -117,7 +127,7 @@ class SequenceFiles:
         """Whether all files of a sequence, with or without a camera, are there from an earlier run."""
         suffixes = [_KINDS[name].suffix for name in self._written_formats(has_camera)]
         suffixes += [VIDEO_SUFFIX] * self._video + [GIF_SUFFIX] * self._gif
-        return all(self._path(suffix).is_file() for suffix in suffixes)
+        return all(self._path(suffix).exists() for suffix in suffixes)
 
     def _written_formats(self, has_camera: bool) -> set[TrackFormat]:
         """KITTI text needs a camera; JSON Lines are written in its place."""
@@ -169,8 +179,8 @@ class SequenceFiles:
         self.has_camera = has_camera or TrackFormat.KITTI not in self._formats
         for name, kind in _KINDS.items():
             if name in formats:
-                is_text = name is TrackFormat.KITTI
-                begin = functools.partial(open_track_text, coasting=self._coasting) if is_text else kind.open
+                options = {"coasting": self._coasting} if kind.takes_coasting else {}
+                begin = functools.partial(kind.open, **options)
                 writers.append((kind, self._stack.enter_context(begin(self._path(kind.suffix)))))
         return writers
 

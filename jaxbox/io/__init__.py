@@ -1,6 +1,7 @@
 """Files in and out: points and recordings of every kind, data sets' layouts, labels, images, and results."""
 
 from jaxbox._files import InputError, atomic_path, atomic_writer, remove_abandoned
+from jaxbox.io.annotations import Annotation, read_annotations
 from jaxbox.io.argoverse2 import (
     read_argoverse2_boxes,
     read_argoverse2_ground,
@@ -54,6 +55,7 @@ __all__ = [
     "POINT_SUFFIXES",
     "RECORDING_SUFFIXES",
     "VEHICLE_TYPES",
+    "Annotation",
     "InputError",
     "KittiObject",
     "LabelledBoxes",
@@ -75,6 +77,7 @@ __all__ = [
     "objects_from_detections",
     "objects_from_tracks",
     "open_sweeps",
+    "read_annotations",
     "read_argoverse2_boxes",
     "read_argoverse2_ground",
     "read_argoverse2_points",
