@@ -21,7 +21,8 @@ AnyBox = TypeVar("AnyBox", bound=Box)
 
 MAX_LISTED = 6
 """Boxes that a text lists, the first ones."""
-_MIN_CORNERS = 3
+MIN_CORNERS = 3
+"""Of a polygon."""
 
 
 class BoxRows(ByValue, Generic[AnyBox]):
@@ -127,7 +128,7 @@ class BoxRows(ByValue, Generic[AnyBox]):
         center = np.asarray(_one_sweep(self).center, np.float64)
         if isinstance(area, RegionConfig):
             return self[(abs(center[:, 0]) < area.half_x_m) & (abs(center[:, 1]) < area.half_y_m)]
-        return self[_in_polygon(center, area)]
+        return self[in_polygon(center, area)]
 
     def unstack(self) -> list[Self]:
         """The sweeps of a batch one by one, on the host: what `jax.vmap` stacked.
@@ -295,10 +296,21 @@ def _label(label: Label | str) -> Label:
     raise ValueError(f"{label!r} is not a class; choose one of {words}.")
 
 
-def _in_polygon(center: np.ndarray, polygon: Any) -> np.ndarray:
-    """Which points (k, 2 or more) are in a polygon: a ray along +x crosses it an odd number of times."""
+def in_polygon(center: np.ndarray, polygon: Any) -> np.ndarray:
+    """Which points are in a polygon: a ray from them along +x crosses it an odd number of times.
+
+    Args:
+      center: (k, 2 or more) float64, m.
+      polygon: (m, 2 or more) m, three corners or more, in either direction.
+
+    Returns:
+      (k,) bool.
+
+    Raises:
+      ValueError: for a polygon of another shape.
+    """
     corners = np.asarray(polygon, np.float64)
-    if corners.ndim != 2 or corners.shape[0] < _MIN_CORNERS or corners.shape[1] < 2:
+    if corners.ndim != 2 or corners.shape[0] < MIN_CORNERS or corners.shape[1] < 2:
         raise ValueError(
             f"the polygon has shape {corners.shape}; it must be (m, 2), three corners or more, in metres; "
             "a rectangle round the sensor is a jaxbox.config.RegionConfig."

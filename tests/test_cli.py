@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 import jaxbox
 from jaxbox import synthetic
-from jaxbox.cli import app, demo, eval_pictures
+from jaxbox.cli import app, demo, eval_pictures, inputs
 from jaxbox.cli.report import (
     SHOWN_MIN_SCORE,
     FrameOutcome,
@@ -31,6 +31,7 @@ from jaxbox.io import (
     read_image,
     read_jsonl,
     read_labels,
+    read_points,
     write_bin,
     write_calibration,
     write_labels,
@@ -92,11 +93,28 @@ def detected(kitti_folder, tmp_path_factory):
 def test_detect_writes_a_result_file_and_pictures_a_sweep(detected):
     output, _ = detected
     names = sorted(str(path.relative_to(output)) for path in output.rglob("*") if path.is_file())
-    expected = ["config.toml", "detections.jsonl", "run.json"]
+    expected = ["config.toml", "contact_sheet.png", "detections.jsonl", "run.json"]
     for name in ("000000", "000001"):
         expected += [f"{name}.txt", f"pictures/{name}_boxes.png", f"pictures/{name}_lidar.png"]
     assert names == sorted(expected)
     assert read_image(output / "pictures" / "000000_boxes.png").shape == (720, 1200, 3)
+
+
+def test_crops_are_the_points_in_the_boxes_in_the_order_of_the_results(kitti_folder, tmp_path, monkeypatch):
+    # So sparse a street has no high scores.
+    monkeypatch.setattr(inputs, "SHOWN_MIN_SCORE", 0.02)
+    file = kitti_folder / "velodyne" / "000000.bin"
+    result = run("detect", file, "--output", tmp_path, "--no-pictures", "--crops", "--classes", "car")
+    assert result.exit_code == 0, result.output
+    xyz, intensity = read_points(file)
+    boxes = enumerate(jaxbox.detect(xyz, DetectorConfig()).of("car").above(0.02))
+    inside = {f"000000_{row:03d}": mask for row, box in boxes if (mask := box.contains(xyz)).any()}
+    crops = {path.stem: read_points(path) for path in (tmp_path / "crops").iterdir()}
+    assert crops.keys() == inside.keys()
+    assert len(crops) > 0
+    for name, mask in inside.items():
+        for cropped, points in zip(crops[name], (xyz, intensity), strict=True):
+            np.testing.assert_array_equal(cropped, points[mask])
 
 
 def test_both_formats_hold_the_same_boxes(detected):

@@ -1,6 +1,7 @@
 """`jaxbox detect` and `info` on other formats: what is written, resumed, interrupted and told to scripts."""
 
 import contextlib
+import csv
 import errno
 import json
 import os
@@ -25,9 +26,9 @@ from jaxbox.io.results import SweepResult
 from jaxbox.run import cache
 from jaxbox.types import PointCloud
 
-ALL = [word for name in ("jsonl", "parquet", "mcap", "rerun") for word in ("--format", name)]
-ONE_FILE = ALL[:6]
-FILES = ["detections.jsonl", "detections.mcap", "detections.parquet"]
+ALL = [word for name in ("jsonl", "parquet", "mcap", "csv", "rerun") for word in ("--format", name)]
+ONE_FILE = ALL[:8]
+FILES = ["detections.jsonl", "detections.mcap", "detections.parquet", "detections.csv"]
 
 
 @pytest.fixture(autouse=True)
@@ -69,6 +70,10 @@ def records_of(output):
     return io.read_jsonl(output / "detections.jsonl")
 
 
+def rows_of(records):
+    return [row for record in records for row in parquet.box_rows(record)]
+
+
 @pytest.fixture(scope="session")
 def written(sweeps, tmp_path_factory):
     """All formats of the three sweeps."""
@@ -88,7 +93,10 @@ def test_the_formats_hold_the_same_boxes(written):
     assert records[0]["boxes"] == records[1]["boxes"], "points without a place change nothing"
     table = pq.read_table(output / "detections.parquet")
     assert table.column_names == list(parquet.PARQUET_COLUMNS)
-    assert table.to_pylist() == [row for record in records for row in parquet.box_rows(record)]
+    assert table.to_pylist() == rows_of(records)
+    rows = list(csv.DictReader((output / "detections.csv").read_text().splitlines()))
+    texts = [{key: "" if v is None else str(v) for key, v in row.items()} for row in rows_of(records)]
+    assert rows == texts
     messages = read_mcap(output / "detections.mcap")
     assert [json.loads(data) for topic, _, data in messages if topic == mcap_results.RECORDS_TOPIC] == records
     assert (output / "detections.rrd").read_bytes()[:3] == b"RRF"
@@ -148,6 +156,7 @@ def test_resume_does_what_is_missing_and_keeps_what_is_there(sweeps, written, tm
     assert pq.read_table(tmp_path / FILES[2]).equals(pq.read_table(whole / FILES[2]))
     assert parquet.finished_parquet(tmp_path / FILES[2]) == {"a", "b", "c"}, "also those without boxes"
     assert read_mcap(tmp_path / FILES[1]) == read_mcap(whole / FILES[1])
+    assert (tmp_path / FILES[3]).read_text() == (whole / FILES[3]).read_text()
 
 
 def test_resume_with_other_settings_or_a_file_that_cannot_be_continued_is_refused(sweeps, tmp_path):
@@ -166,6 +175,26 @@ def test_resume_with_other_settings_or_a_file_that_cannot_be_continued_is_refuse
         assert "run.json: --resume needs the options of the earlier run" in result.stderr
     (tmp_path / "config.toml").unlink()
     assert detect(tmp_path, *common, "--resume").exit_code == 0, "a run that was killed before it had begun"
+
+
+def test_filters_choose_boxes_are_recorded_and_held_by_resume(sweeps, written, tmp_path):
+    (tmp_path / "area.txt").write_text("0 -10\n20, -10\n20 10\n")
+    common = (sweeps / "a.bin", "--format", "jsonl", "--classes", "vans,car", "--min-score", "0.005")
+    found = jaxbox.detect(io.read_points(sweeps / "a.bin")[0], DetectorConfig())
+    whole = records_of(written[0])[0]["boxes"]
+    for name, area in (("rectangle", "-10,30,-10.5,10"), ("polygon", tmp_path / "area.txt")):
+        output = tmp_path / name
+        assert detect(output, *common, "--within", area).exit_code == 0
+        options = json.loads((output / "run.json").read_text())["options"]
+        kept = found.of(*options["classes"]).within(options["within"]).above(options["min_score"])
+        boxes = records_of(output)[0]["boxes"]
+        assert 0 < len(boxes) < len(whole)
+        assert all(box in whole for box in boxes)
+        np.testing.assert_array_equal([box["center"] for box in boxes], kept.center)
+        result = detect(output, *common, "--within", "30", "--resume")
+        assert result.exit_code == 2
+        assert "within differ" in result.stderr
+        assert detect(output, *common, "--within", area, "--resume").exit_code == 0
 
 
 def test_settings_are_there_only_where_the_options_are_too(sweeps, tmp_path, monkeypatch):

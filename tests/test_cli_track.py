@@ -16,9 +16,11 @@ from test_cli_formats import heard_ctrl_c
 
 from jaxbox import Status, TrackStatus, io, synthetic
 from jaxbox.cli.config_options import chosen_track_config
+from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.cli.track_report import SequenceReport
 from jaxbox.cli.track_results import SequenceFiles, TrackFormat
 from jaxbox.evaluation.tracking.folders import evaluate_tracking_folders
+from jaxbox.geometry.rigid import rotation_about_z
 from jaxbox.io import mcap_results
 from jaxbox.io import rerun as rerun_results
 from jaxbox.io.mcap_file import open_mcap_file
@@ -29,6 +31,7 @@ from jaxbox.run import cache
 STEP_M = 1.0
 LENGTHS = {"0000": 5, "0001": 3}
 ALL = [word for name in TrackFormat for word in ("--format", name)]
+FILMS = ["--pictures", "--video", "--gif", "--crops"]
 LIGHT = ["--format", "kitti", "--format", "jsonl", "--capacity", CAPACITY]
 
 
@@ -66,11 +69,11 @@ def track(kitti, output, *arguments):
 
 @pytest.fixture(scope="session")
 def written(kitti, tmp_path_factory):
-    """What a whole run writes, in every format, with pictures and videos."""
+    """What a whole run writes, in every format, with pictures, crops and films."""
     output = tmp_path_factory.mktemp("written")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(cache.CACHE_VARIABLE, "")
-        result = track(kitti, output, *ALL, "--pictures", "--video", "--capacity", CAPACITY)
+        result = track(kitti, output, *ALL, *FILMS, "--capacity", CAPACITY)
     assert result.exit_code == 0, result.output
     return output, result
 
@@ -81,9 +84,11 @@ def records_of(output, sequence="0000"):
 
 def test_every_sequence_has_every_file_and_the_account(written, kitti):
     output, result = written
-    suffixes = ("txt", "jsonl", "parquet", "csv", "mcap", "rrd", "mp4")
+    suffixes = ("txt", "jsonl", "parquet", "csv", "mcap", "rrd", "mp4", "gif")
     expected = {f"{sequence}.{suffix}" for sequence in LENGTHS for suffix in suffixes}
-    assert {path.name for path in output.iterdir()} == expected | {"config.toml", "run.json", "pictures"}
+    expected |= {f"{sequence}_{tool}" for sequence in LENGTHS for tool in ("cvat", "labelcloud", "xtreme1")}
+    beside = {"config.toml", "run.json", "pictures", "crops", "contact_sheet.png"}
+    assert {path.name for path in output.iterdir()} == expected | beside
     account = json.loads((output / "run.json").read_text())
     assert account["finished"]
     assert account["incomplete"] == []
@@ -149,6 +154,35 @@ def test_kitti_text_is_what_the_evaluation_reads(written, kitti, tmp_path):
     assert report["kitti"]["Car"]["clear"]["num_labels"] > 0
 
 
+def test_labels_for_annotation_tools_hold_the_seen_and_confirmed_tracks(written):
+    output, _ = written
+    shown = {}
+    for record in records_of(output):
+        boxes = [box for box in record["boxes"] if box["confirmed"] and box["sight"] == "seen"]
+        shown[record["name"]] = [box["id"] for box in boxes if box["score"] >= SHOWN_MIN_SCORE]
+    assert any(shown.values())
+    for tool in ("cvat", "xtreme1"):
+        sweeps = io.open_sweeps(output / f"0000_{tool}")
+        assert {s.name: [item.track_id for item in s.read_labels()] for s in sweeps} == shown
+    sweeps = io.open_sweeps(output / "0000_labelcloud")
+    assert {s.name: len(s.read_labels()) for s in sweeps} == {name: len(ids) for name, ids in shown.items()}
+
+
+def test_labels_of_a_tool_are_detected_in_and_evaluated(written, tmp_path):
+    labels = written[0] / "0000_labelcloud"
+    options = ("--output", tmp_path, "--no-pictures", "--capacity", CAPACITY)
+    assert run("detect", labels, *options).exit_code == 0
+    result = run("eval", "--labels", labels, "--results", tmp_path, "--json", tmp_path / "report.json")
+    assert result.exit_code == 0, result.output
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["num_frames"] == LENGTHS["0000"]
+    # What the tracker shows is what was detected, with a box that its sweeps agree on.
+    rate = report["selections"]["all"]["rates"][0]
+    assert rate["num_labels"] > 0
+    assert rate["recall"] > 0.8
+    assert "2D box" not in result.output
+
+
 def test_tables_hold_a_row_for_each_track_and_sweep(written):
     output, _ = written
     boxes = [(record, box) for record in records_of(output) for box in record["boxes"]]
@@ -211,18 +245,50 @@ def test_a_rerun_recording_holds_boxes_trails_and_velocities(written):
 
 def test_a_video_has_a_picture_a_sweep_and_the_camera_above(written):
     output, _ = written
-    for sequence, shape in (("0000", (720 + 362, 1200)), ("0001", (720, 1200))):
-        video = cv2.VideoCapture(str(output / f"{sequence}.mp4"))
+    shapes = {"0000.mp4": (720 + 362, 1200), "0001.mp4": (720, 1200), "0000.gif": (288 + 145, 480)}
+    for name, shape in shapes.items():
+        video = cv2.VideoCapture(str(output / name))
         pictures = []
         while (read := video.read())[0]:
             pictures.append(read[1])
-        assert len(pictures) == LENGTHS[sequence]
+        assert len(pictures) == LENGTHS[name[:4]]
         assert pictures[0].shape[:2] == shape
         assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(10, abs=0.01)
     assert len(list((output / "pictures").iterdir())) == sum(LENGTHS.values())
     picture = io.read_image(output / "pictures" / "0001_000002_tracks.png")
     assert picture.shape == (720, 1200, 3)
     assert np.ptp(picture.reshape(-1, 3).astype(int), axis=1).max() > 100, "no coloured box"
+
+
+def test_crops_are_the_points_in_the_boxes_of_confirmed_tracks_by_their_ids(written, kitti):
+    output, _ = written
+    record = records_of(output)[4]
+    xyz = io.read_points(kitti / "velodyne" / "0000" / "000004.bin")[0]
+    expected = {}
+    for box in record["boxes"]:
+        offset = (xyz - box["center"]) @ rotation_about_z(box["heading"])
+        inside = np.all(np.abs(offset) <= np.array(box["size"]) / 2, axis=1)
+        if box["confirmed"] and box["score"] >= SHOWN_MIN_SCORE and inside.any():
+            expected[f"0000_000004_{box['id']:03d}.pcd"] = int(inside.sum())
+    assert expected
+    files = (output / "crops").glob("0000_000004_*.pcd")
+    found = {path.name: len(io.read_points(path)[0]) for path in files}
+    # A point on a face is in or out by the last bit.
+    assert found == {name: pytest.approx(count, abs=1) for name, count in expected.items()}
+
+
+def test_a_drive_in_part_of_the_world_and_of_one_class(kitti, written, tmp_path):
+    near = ("--within", "15", "--classes", "car", "--no-contact-sheet")
+    assert track(kitti, tmp_path, *LIGHT, *near).exit_code == 0
+    num_kept = 0
+    for record, whole in zip(records_of(tmp_path), records_of(written[0]), strict=True):
+        kept = [box for box in whole["boxes"] if box["label"] == "car" and np.hypot(*box["center"][:2]) <= 15]
+        assert record["boxes"] == kept
+        assert record["counts"] == whole["counts"], "the tracker sees all"
+        assert len(kept) < len(whole["boxes"])
+        num_kept += len(kept)
+    assert num_kept > 0
+    assert not (tmp_path / "contact_sheet.png").exists()
 
 
 def test_poses_of_the_data_set_and_of_a_file_are_the_same(kitti, tmp_path):
@@ -398,13 +464,14 @@ def test_settings_of_the_tracker_are_changed_by_name():
 
 
 def test_a_failure_leaves_an_earlier_file_as_it_was(tmp_path):
-    files = functools.partial(SequenceFiles, coasting=False, points=False, pictures=False, video=True)
+    wanted = {"coasting": False, "points": False, "pictures": False, "video": True, "gif": False}
+    files = functools.partial(SequenceFiles, **wanted)
     (tmp_path / "a.mp4").write_bytes(b"earlier")
 
     def fail():
         with files(tmp_path, "a", frozenset()) as opened:
             for index in range(3):
-                opened.add_picture("a", np.zeros((20, 30, 3), np.uint8), index * 10**8)
+                opened.add_pictures("a", np.zeros((20, 30, 3), np.uint8), None, index * 10**8)
             raise RuntimeError
 
     with pytest.raises(RuntimeError):

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from jaxbox._version import __version__
+from jaxbox.cli.box_filter import BoxFilter, ClassesOption, WithinOption
 from jaxbox.cli.config_options import chosen_config, chosen_preset
 from jaxbox.cli.console import cache_warnings, input_errors, stdout
 from jaxbox.cli.demo import run_demo
@@ -18,6 +19,7 @@ from jaxbox.cli.options import (
     EXIT_CODES,
     AddressOption,
     CapacityOption,
+    CropsOption,
     DrivesOption,
     Engine,
     EngineOption,
@@ -29,9 +31,10 @@ from jaxbox.cli.options import (
     SensorOption,
     SetOption,
     SettingsOption,
+    SheetOption,
     TopicOption,
 )
-from jaxbox.cli.ray_engine import check_local
+from jaxbox.cli.ray_engine import check_local, check_ray
 from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.cli.sweep_info import print_sweep_info
 from jaxbox.cli.threads import compute_on_one_thread
@@ -147,6 +150,8 @@ def detect(
             f"pictures and counts never show less than {SHOWN_MIN_SCORE:g}.",
         ),
     ] = 0.0,
+    classes: ClassesOption = None,
+    within: WithinOption = None,
     points: Annotated[
         bool | None,
         typer.Option(
@@ -159,6 +164,8 @@ def detect(
             "--pictures/--no-pictures", help="Draw pictures of each sweep. By default yes, but not with ray."
         ),
     ] = None,
+    sheet: SheetOption = True,
+    crops: CropsOption = False,
     jobs: Annotated[
         int | None,
         typer.Option(
@@ -191,7 +198,9 @@ def detect(
     """
     with input_errors():
         config = chosen_config(preset, settings, changes or [], sensor=sensor)
+        keep = BoxFilter.chosen(classes=classes, within=within)
         if engine is Engine.RAY:
+            check_ray({"--classes": classes, "--within": within, "--crops": crops})
             ray_options = DetectRayOptions(
                 output=output,
                 config=config,
@@ -224,6 +233,9 @@ def detect(
             level=level,
             capacity=capacity,
             min_score=min_score,
+            keep=keep,
+            crops=crops,
+            sheet=sheet,
             points=True if points is None else points,
             pictures=True if pictures is None else pictures,
             jobs=jobs or 1,
@@ -241,7 +253,9 @@ app.command("eval", epilog=EXIT_CODES)(evaluate)
 @app.command(epilog=EXIT_CODES)
 def tune(
     *,
-    labels: Annotated[pathlib.Path, typer.Option(help="A labelled KITTI folder.")],
+    labels: Annotated[
+        pathlib.Path, typer.Option(help="A labelled KITTI folder, or that of an annotation tool.")
+    ],
     output: Annotated[pathlib.Path, typer.Option(help="Folder for the report and the best settings.")],
     search: Annotated[
         list[str] | None,

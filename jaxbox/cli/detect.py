@@ -9,6 +9,7 @@ from rich.progress import Progress
 from jaxbox import io
 from jaxbox._interrupts import heard, stoppable, undisturbed
 from jaxbox.cli.console import ExitCode, exit_code, make_progress, print_error, stderr, stdout
+from jaxbox.cli.crops import CROP_FOLDER
 from jaxbox.cli.frames import Frame, FrameSource, FrameWork
 from jaxbox.cli.inputs import PICTURE_FOLDER, RunOptions, prepare_run, print_json, reasons_as_json
 from jaxbox.cli.report import (
@@ -18,7 +19,8 @@ from jaxbox.cli.report import (
     describe_frame,
     describe_run,
 )
-from jaxbox.cli.results import ResultFormat, Results
+from jaxbox.cli.results import ResultFormat, Results, written
+from jaxbox.cli.run_sheet import SHEET_NAME, RunSheet
 from jaxbox.io.jsonl import JSONL
 from jaxbox.run.processes import WorkerDied
 from jaxbox.run.summary import summarise
@@ -58,6 +60,7 @@ def run_detect(
     if frames is not None:
         sweeps = [sweep for sweep in sweeps if sweep.name in frames]
     run = RunReport(jobs=options.jobs)
+    sheet = RunSheet(options.output, sweeps, shown=options.sheet)
     start = time.perf_counter()
     with Results(
         options.output,
@@ -67,7 +70,9 @@ def run_detect(
         points=options.points,
     ) as results:
         account.write(finished=False)
-        _run_sweeps(sweeps, options, run, results)
+        _run_sweeps(sweeps, options, run, results, sheet)
+    with written(options.output / SHEET_NAME):
+        sheet.write(min_score=options.shown_min_score)
     run.elapsed_s = time.perf_counter() - start
     account.write(
         finished=not (run.interrupted or run.failures),
@@ -81,15 +86,17 @@ def run_detect(
     return exit_code(failed=bool(run.failures), interrupted=run.interrupted)
 
 
-def _run_sweeps(sweeps: Sequence[io.Sweep], options: DetectOptions, run: RunReport, results: Results) -> None:
+def _run_sweeps(
+    sweeps: Sequence[io.Sweep], options: DetectOptions, run: RunReport, results: Results, sheet: RunSheet
+) -> None:
     """Every sweep; ends early, with what is done, where it is interrupted or a recording breaks off."""
     with stoppable(), make_progress(shown=options.speaks) as progress:
         task = progress.add_task("detecting", total=len(sweeps))
         missing = _missing(sweeps, results, run, progress)
-        frames = _frames(missing, options, run, results)
+        frames = _frames(missing, options, run, results, sheet.names)
         try:
             for sweep, wait in frames:
-                _run_frame(sweep, wait, options, run, results)
+                _run_frame(sweep, wait, options, run, results, sheet)
                 progress.advance(task)
         except io.InputError as error:
             run.failures.append(("the recording", str(error)))
@@ -115,13 +122,20 @@ def _missing(
 
 
 def _frames(
-    sweeps: Iterator[io.Sweep], options: DetectOptions, run: RunReport, results: Results
+    sweeps: Iterator[io.Sweep],
+    options: DetectOptions,
+    run: RunReport,
+    results: Results,
+    tiles: frozenset[str],
 ) -> FrameSource:
     """The frames of the sweeps, made here or by that many processes."""
     work = FrameWork(
         config=options.config,
         capacity=options.capacity,
+        keep=options.keep,
         picture_folder=options.output / PICTURE_FOLDER if options.pictures else None,
+        crop_folder=options.output / CROP_FOLDER if options.crops else None,
+        tiles=tiles,
         shown_min_score=options.shown_min_score,
         keep_points=results.wants_points,
         keep_image=results.wants_image,
@@ -160,10 +174,13 @@ def _run_frame(
     options: DetectOptions,
     run: RunReport,
     results: Results,
+    sheet: RunSheet,
 ) -> None:
     """One sweep, its files and its lines; a failure is added to the run."""
     try:
-        report = _write(sweep, wait(), options, run, results)
+        frame = wait()
+        sheet.add(frame.tile)
+        report = _write(sweep, frame, options, run, results)
     except (io.InputError, OSError, WorkerDied) as error:
         run.failures.append((sweep.name, str(error)))
         print_error(f"sweep {sweep.name}: {error}")

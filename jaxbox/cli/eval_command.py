@@ -18,7 +18,10 @@ from jaxbox.evaluation.protocols import Protocol
 
 def evaluate(
     *,
-    labels: Annotated[pathlib.Path, typer.Option(help="The KITTI folder that was given to `detect`.")],
+    labels: Annotated[
+        pathlib.Path,
+        typer.Option(help="The KITTI folder, or that of an annotation tool, that was given to `detect`."),
+    ],
     results: Annotated[pathlib.Path, typer.Option(help="The folder that `detect` wrote to.")],
     json: Annotated[pathlib.Path | None, typer.Option(help="Also write every figure to this file.")] = None,
     plots: Annotated[

@@ -9,6 +9,7 @@ from rich.console import Console
 
 from jaxbox import io
 from jaxbox._version import __version__
+from jaxbox.cli.box_filter import BoxFilter
 from jaxbox.cli.console import ExitCode
 from jaxbox.cli.detect import DetectOptions, run_detect
 from jaxbox.cli.evaluate import METRIC_NAMES, print_report
@@ -83,6 +84,9 @@ def _detect_options(results: pathlib.Path, options: ProtocolOptions) -> DetectOp
         level=False,
         capacity=None,
         min_score=0.0,
+        keep=BoxFilter(),
+        crops=False,
+        sheet=False,
         resume=True,
         quiet=False,
         json=False,

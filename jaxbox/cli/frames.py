@@ -6,25 +6,28 @@ import pathlib
 import time
 from collections.abc import Callable, Generator, Iterable
 
-import jax
 import numpy as np
 
 from jaxbox import io
+from jaxbox.cli.box_filter import BoxFilter
+from jaxbox.cli.crops import write_crops
+from jaxbox.cli.run_sheet import TILE_FRAME
 from jaxbox.cli.timing import TimedDetector
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation.iou import image_fractions
-from jaxbox.geometry.projection import project_boxes
+from jaxbox.io.kitti import boxes_in_image
 from jaxbox.io.points import Points
 from jaxbox.run.processes import ProcessPool, ahead
 from jaxbox.types import Calibration, Detections, PointCloud
-from jaxbox.viz import BoxSet, draw_stages, save_png
+from jaxbox.viz import BoxSet, draw_bird_eye, draw_image_boxes, draw_stages, save_png
+from jaxbox.viz.colors import color_by_height
+from jaxbox.viz.image_boxes import scale_camera
+from jaxbox.viz.stages import height_above_plane
 
 SHOWN_PICTURES = ("boxes", "lidar", "image")
 """Of the pictures of the stages, those that show the answer."""
 DONT_CARE_SHARE = 0.5
 """A box with a larger share of its 2D box in one DontCare region is not judged."""
-
-_project_boxes = jax.jit(project_boxes)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -47,8 +50,10 @@ class Frame:
     """Seconds of reading and drawing."""
     compile_s: dict[int, float]
     """Seconds that each capacity took to compile, in the process that did this sweep."""
+    tile: np.ndarray | None
+    """(h, w, 3) uint8 for the contact sheet, red green blue; None where it is not wanted."""
     picture_error: Exception | None
-    """Why the pictures could not be drawn; None where they could, or were not wanted."""
+    """Why pictures or crops could not be made; None where they could, or were not wanted."""
 
 
 FrameSource = Generator[tuple[io.Sweep, Callable[[], Frame]], None, None]
@@ -74,10 +79,16 @@ class FrameWork:
     """The detector's settings."""
     capacity: int | None
     """Points a sweep is padded to, or None for what it needs."""
+    keep: BoxFilter
+    """Which boxes are kept of those that are found."""
     picture_folder: pathlib.Path | None
     """Where pictures go; None for none."""
+    crop_folder: pathlib.Path | None
+    """Where the points in each box go; None for nowhere."""
+    tiles: frozenset[str]
+    """Names of the sweeps that are drawn for the contact sheet."""
     shown_min_score: float
-    """Boxes that score less are not drawn."""
+    """Boxes that score less are neither drawn nor cropped."""
     keep_points: bool
     """Whether results need the points."""
     keep_image: bool
@@ -132,8 +143,13 @@ class FrameWork:
         padding_s = time.perf_counter() - start
         detections, detect_s = detector(cloud)
         start = time.perf_counter()
-        detections = detections.on_host()
-        picture_error = self._draw(read, cloud, detections)
+        detections = self.keep(detections.on_host())
+        tile, picture_error = None, None
+        try:
+            tile = self._draw(read, cloud, detections)
+        except (io.InputError, OSError) as error:
+            # The results do not depend on whether they can be drawn.
+            picture_error = error
         return Frame(
             num_points=len(read.points[0]),
             detections=detections,
@@ -143,42 +159,67 @@ class FrameWork:
             detect_s=detect_s,
             other_s=read.seconds + padding_s + time.perf_counter() - start,
             compile_s=dict(detector.compile_s),
+            tile=tile,
             picture_error=picture_error,
         )
 
-    def _draw(self, read: _Read, cloud: PointCloud, detections: Detections) -> Exception | None:
-        """Draws the pictures where they are wanted; the results do not depend on whether they can be."""
-        if self.picture_folder is None:
+    def _draw(self, read: _Read, cloud: PointCloud, detections: Detections) -> np.ndarray | None:
+        """Writes crops and pictures, and returns the tile, where they are wanted."""
+        name, min_score = read.sweep.name, self.shown_min_score
+        if self.crop_folder is not None:
+            write_crops(self.crop_folder, name, read.points, enumerate(detections), min_score=min_score)
+        if self.picture_folder is None and name not in self.tiles:
             return None
-        try:
-            _write_pictures(read, cloud, detections, self.picture_folder, self.shown_min_score)
-        except (io.InputError, OSError) as error:
-            return error
-        return None
+        shown = _judge(read, detections, min_score)
+        if self.picture_folder is not None:
+            pictures = draw_stages(
+                cloud,
+                detections,
+                calibration=read.calibration,
+                image=shown.image,
+                truth=shown.truth,
+                judged=shown.judged,
+                min_score=min_score,
+            )
+            for kind in SHOWN_PICTURES:
+                if kind in pictures:
+                    save_png(self.picture_folder / f"{name}_{kind}.png", pictures[kind])
+        return _draw_tile(read, detections, shown, min_score) if name in self.tiles else None
 
 
-def _write_pictures(
-    read: _Read, cloud: PointCloud, detections: Detections, folder: pathlib.Path, min_score: float
-) -> None:
-    sweep, calibration = read.sweep, read.calibration
-    labels = sweep.read_labels()
-    truth = judged = None
-    if labels is not None and calibration is not None:
-        truth = label_boxes(labels, calibration)
-        shown = np.asarray(detections.valid) & (np.asarray(detections.score, np.float64) >= min_score)
-        judged = covered_by_labels(detections, labels, calibration)[shown]
-    pictures = draw_stages(
-        cloud,
-        detections,
-        calibration=calibration,
-        image=sweep.read_image() if read.image is None else read.image,
-        truth=truth,
-        judged=judged,
-        min_score=min_score,
-    )
-    for kind in SHOWN_PICTURES:
-        if kind in pictures:
-            save_png(folder / f"{sweep.name}_{kind}.png", pictures[kind])
+@dataclasses.dataclass(frozen=True)
+class _Shown:
+    """What pictures of a sweep show besides its points and boxes, each None where there is none."""
+
+    image: np.ndarray | None
+    """(h, w, 3) uint8, red green blue."""
+    truth: BoxSet | None
+    """Labelled vehicles."""
+    judged: np.ndarray | None
+    """(boxes from the score on,) bool: those that the labels speak about."""
+
+
+def _judge(read: _Read, detections: Detections, min_score: float) -> _Shown:
+    labels, calibration = read.sweep.read_labels(), read.calibration
+    image = read.sweep.read_image() if read.image is None else read.image
+    if labels is None or calibration is None:
+        return _Shown(image, None, None)
+    shown = np.asarray(detections.valid) & (np.asarray(detections.score, np.float64) >= min_score)
+    covered = covered_by_labels(detections, labels, calibration)
+    return _Shown(image, label_boxes(labels, calibration), covered[shown])
+
+
+def _draw_tile(read: _Read, detections: Detections, shown: _Shown, min_score: float) -> np.ndarray:
+    """The sweep from above, under the camera's image where there is one, at the width of a tile."""
+    xyz = np.asarray(read.points[0], np.float64)
+    boxes = BoxSet.from_detections(detections, min_score=min_score)
+    common = {"boxes": boxes, "truth": shown.truth, "judged": shown.judged, "legend": False}
+    colors = color_by_height(height_above_plane(xyz, detections))
+    above = draw_bird_eye(xyz, colors=colors, frame=TILE_FRAME, title=read.sweep.name, **common)
+    if shown.image is None or read.calibration is None:
+        return above
+    scaled, camera = scale_camera(shown.image, read.calibration, width_px=above.shape[1])
+    return np.concatenate([draw_image_boxes(scaled, camera, **common), above])
 
 
 def label_boxes(labels: Iterable[io.KittiObject], calibration: Calibration) -> BoxSet:
@@ -201,9 +242,9 @@ def covered_by_labels(
     Returns:
       (K,) bool, padding included.
     """
-    projected = _project_boxes(detections.center, detections.size, detections.yaw, calibration)
-    boxes_px = np.asarray(projected.boxes_px, np.float64)
-    covered = np.asarray(projected.visible).copy()
+    boxes_px, _, covered = boxes_in_image(
+        np.asarray(detections.center), np.asarray(detections.size), np.asarray(detections.yaw), calibration
+    )
     for label in labels:
         if label.is_dont_care:
             covered &= (

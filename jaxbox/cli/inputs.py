@@ -8,7 +8,9 @@ from typing import Any
 
 from jaxbox import io
 from jaxbox._files import check_no_link
+from jaxbox.cli.box_filter import BoxFilter
 from jaxbox.cli.console import stdout
+from jaxbox.cli.crops import CROP_FOLDER
 from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
 from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.cli.results import RUN_NAME, RunAccount, written
@@ -36,6 +38,12 @@ class RunOptions:
     """Points a sweep is padded to, or None for what it needs."""
     min_score: float
     """Boxes with lower scores are dropped."""
+    keep: BoxFilter
+    """Which other boxes are dropped."""
+    crops: bool
+    """Whether the points in each box are written."""
+    sheet: bool
+    """Whether there is a contact sheet of the run."""
     resume: bool
     """Whether what has complete results is passed over."""
     quiet: bool
@@ -78,6 +86,7 @@ def prepare_run(
         config=options.config,
         options={
             "min_score": options.min_score,
+            **options.keep.recorded(),
             "capacity": options.capacity,
             "topic": options.topic,
             "sensor_at": None if options.sensor_at is None else list(options.sensor_at),
@@ -96,10 +105,12 @@ def prepare_run(
     if options.level and mounting is not None and options.speaks:
         where = f"see T_level_points in {RUN_NAME}"
         stdout().print(f"{describe_mounting(mounting)}, {where}", markup=False)
-    check_no_link(options.output / PICTURE_FOLDER)
+    folders = (options.output, options.output / PICTURE_FOLDER, options.output / CROP_FOLDER)
+    for folder in folders[1:]:
+        check_no_link(folder)
     with written(options.output):
         options.output.mkdir(parents=True, exist_ok=True)
-    for folder in (options.output, options.output / PICTURE_FOLDER):
+    for folder in folders:
         io.remove_abandoned(folder)
     return sweeps, dataclasses.replace(account, mounting=mounting)
 

@@ -82,6 +82,16 @@ CapacityOption = Annotated[
     int | None,
     typer.Option(min=1, help="Points a sweep is padded to; by default what it needs. One compile each."),
 ]
+CropsOption = Annotated[
+    bool, typer.Option("--crops", help="Write the points in each box: OUTPUT/crops/SWEEP_NUMBER.pcd.")
+]
+SheetOption = Annotated[
+    bool,
+    typer.Option(
+        "--contact-sheet/--no-contact-sheet",
+        help="One picture of sweeps from all over the run: OUTPUT/contact_sheet.png.",
+    ),
+]
 QuietOption = Annotated[bool, typer.Option("--quiet", help="Print only what went wrong.")]
 JsonOption = Annotated[
     bool, typer.Option("--json", help="Print one JSON object a sweep, and a summary, for scripts.")

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from rich.progress import Progress
@@ -87,6 +87,20 @@ class RayOptions:
             "topic": self.topic,
             "resume": self.resume,
         }
+
+
+def check_ray(options: Mapping[str, object]) -> None:
+    """Refuses what is not for this engine.
+
+    Args:
+      options: by name, what was given.
+
+    Raises:
+      InputError: naming the first that was.
+    """
+    for name, value in options.items():
+        if value:
+            raise InputError(f"{name}: the workers of --engine ray have no such option; leave it out.")
 
 
 def check_local(output: str, address: str | None) -> None:

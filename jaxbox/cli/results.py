@@ -16,6 +16,8 @@ from jaxbox.cli.console import OutputError
 from jaxbox.config import DetectorConfig
 from jaxbox.config.fields import differing_names, recorded_options
 from jaxbox.geometry.mounting import Mounting
+from jaxbox.io.annotation_results import CVAT, LABELCLOUD, XTREME1
+from jaxbox.io.csv_table import CSV
 from jaxbox.io.jsonl import JSONL
 from jaxbox.io.mcap_results import MCAP_RESULTS
 from jaxbox.io.parquet import PARQUET
@@ -39,15 +41,23 @@ class ResultFormat(enum.StrEnum):
     JSONL = "jsonl"
     BOTH = "both"
     PARQUET = "parquet"
+    CSV = "csv"
     MCAP = "mcap"
     RERUN = "rerun"
+    CVAT = "cvat"
+    LABELCLOUD = "labelcloud"
+    XTREME1 = "xtreme1"
 
 
 FILES: Mapping[ResultFormat, ResultFile] = {
     ResultFormat.JSONL: JSONL,
     ResultFormat.PARQUET: PARQUET,
+    ResultFormat.CSV: CSV,
     ResultFormat.MCAP: MCAP_RESULTS,
     ResultFormat.RERUN: RERUN,
+    ResultFormat.CVAT: CVAT,
+    ResultFormat.LABELCLOUD: LABELCLOUD,
+    ResultFormat.XTREME1: XTREME1,
 }
 """Formats of one file a run; KITTI text is one a sweep."""
 

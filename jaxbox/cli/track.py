@@ -18,11 +18,13 @@ from jaxbox.cli.console import (
     stderr,
     stdout,
 )
+from jaxbox.cli.crops import CROP_FOLDER, write_crops
 from jaxbox.cli.inputs import RunOptions, prepare_run, print_json, reasons_as_json
 from jaxbox.cli.kept import KeptSweep
-from jaxbox.cli.results import RunAccount
+from jaxbox.cli.results import RunAccount, written
+from jaxbox.cli.run_sheet import SHEET_NAME, TILE_FRAME, RunSheet
 from jaxbox.cli.track_report import SequenceReport, TrackReport
-from jaxbox.cli.track_results import SequenceFiles, TrackFormat
+from jaxbox.cli.track_results import GIF_FRAME, SequenceFiles, TrackFormat
 from jaxbox.config import TrackConfig
 from jaxbox.config.fields import all_fields
 from jaxbox.io.drive_records import DriveRecords
@@ -32,7 +34,7 @@ from jaxbox.run.pose_providers import without_points
 from jaxbox.run.tracking import TrackedSweep, smooth_tracks, track
 from jaxbox.tracking.poses import Poses, PoseSource
 from jaxbox.tracking.trails import Trails
-from jaxbox.viz import draw_drive
+from jaxbox.viz import BirdEyeFrame, draw_drive
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -61,6 +63,8 @@ class TrackOptions(RunOptions):
     """Whether each sweep is drawn."""
     video: bool
     """Whether there is a video of each drive."""
+    gif: bool
+    """Whether there is an animated GIF of each drive."""
 
     def recorded(self) -> dict:
         """What the results depend on besides the detector's settings, as JSON can hold it."""
@@ -79,6 +83,7 @@ class TrackOptions(RunOptions):
             points=self.points,
             pictures=self.pictures,
             video=self.video,
+            gif=self.gif,
         )
 
 
@@ -104,6 +109,7 @@ def run_track(paths: Sequence[str], options: TrackOptions) -> ExitCode:
     sequences = io.group_sequences(sweeps)
     earlier = account.earlier_incomplete() if options.resume else None
     run, start = TrackReport(), time.perf_counter()
+    sheet = RunSheet(options.output, sweeps, shown=options.sheet)
     pending = [name for name, group in sequences if not _is_finished(name, group, options, earlier)]
     account.write(finished=False, incomplete=pending)
     with stoppable(), make_progress(shown=options.speaks) as progress:
@@ -115,13 +121,15 @@ def run_track(paths: Sequence[str], options: TrackOptions) -> ExitCode:
                 continue
             report = SequenceReport(name)
             run.sequences.append(report)
-            _run_sequence(group, report, options, lambda: progress.advance(task))
+            _run_sequence(group, report, options, sheet, lambda: progress.advance(task))
             if report.is_complete:
                 pending.remove(name)
             _write_account(account, run, pending)
             _describe_sequence(report, options)
             if report.interrupted:
                 break
+    with written(options.output / SHEET_NAME):
+        sheet.write(min_score=options.shown_min_score)
     _describe_run(run, options, time.perf_counter() - start)
     return exit_code(failed=bool(run.failures), interrupted=run.interrupted)
 
@@ -132,7 +140,7 @@ def _is_finished(
     """Whether an earlier run has done a whole sequence; `earlier` are those that it has not."""
     if earlier is None or name in earlier or len(sweeps) == 0:
         return False
-    return options.files_of(name).are_there(has_camera=sweeps[0].calibration_path is not None)
+    return options.files_of(name).are_there(has_camera=sweeps[0].is_calibrated)
 
 
 def _write_account(account: RunAccount, run: TrackReport, pending: Sequence[str]) -> None:
@@ -148,14 +156,19 @@ def _write_account(account: RunAccount, run: TrackReport, pending: Sequence[str]
 
 
 def _run_sequence(
-    sweeps: Sequence[io.Sweep], report: SequenceReport, options: TrackOptions, advance: Callable[[], None]
+    sweeps: Sequence[io.Sweep],
+    report: SequenceReport,
+    options: TrackOptions,
+    sheet: RunSheet,
+    advance: Callable[[], None],
 ) -> None:
     """One sequence and its files."""
     if len(sweeps) == 0:
         _fail(report, report.name, "no sweeps in it; the recording is empty.")
         return
     with options.files_of(report.name) as files:
-        _Drive(sweeps, report, options, files, advance).go()
+        files.expect(len(sweeps))
+        _Drive(sweeps, report, options, files, sheet, advance).go()
         report.has_camera = files.has_camera
     report.is_complete = not (report.failures or report.interrupted)
 
@@ -174,10 +187,11 @@ class _Drive:
         report: SequenceReport,
         options: TrackOptions,
         files: SequenceFiles,
+        sheet: RunSheet,
         advance: Callable[[], None],
     ) -> None:
         self._sweeps, self._report, self._options = sweeps, report, options
-        self._files, self._advance = files, advance
+        self._files, self._sheet, self._advance = files, sheet, advance
         self._trails = Trails()
         self._records = DriveRecords(report.name, min_score=options.min_score, confirmed=options.confirmed)
 
@@ -207,10 +221,9 @@ class _Drive:
 
     def _track(self) -> Generator[TrackedSweep, None, None]:
         # Results and pictures show points that were read anyway.
-        keeps = self._files.wants_points
         options = self._options
         return track(
-            (KeptSweep(sweep, keeps=keeps) for sweep in self._sweeps),
+            (KeptSweep(sweep, keeps=self._wants_points(sweep.name)) for sweep in self._sweeps),
             options.config,
             options.track_config,
             poses=self._find_poses(),
@@ -219,6 +232,9 @@ class _Drive:
             rate_hz=options.rate_hz,
             workers=options.jobs,
         )
+
+    def _wants_points(self, name: str) -> bool:
+        return self._files.wants_points or self._options.crops or name in self._sheet.names
 
     def _find_poses(self) -> Poses | PoseSource | None:
         return choose_poses(
@@ -236,26 +252,36 @@ class _Drive:
         """Adds a sweep to the files; a failure to read what belongs to it is one of the sweep."""
         kept = tracked.sweep
         assert isinstance(kept, KeptSweep)
+        if tracked.tracks is not None:
+            tracked = dataclasses.replace(tracked, tracks=self._options.keep(tracked.tracks))
         record = self._records.record(index, tracked)
         try:
             result = self._gather(kept, tracked, record)
         except (io.InputError, OSError) as error:
             _fail(self._report, tracked.name, str(error))
             return
-        picture = self._draw(tracked, result) if self._files.wants_pictures else None
+        time = f"{record['time_s']:.1f} s"
+        picture = small = None
+        if self._files.wants_pictures:
+            title = f"{tracked.name}  {time}  poses: {record['pose_source']}"
+            picture = self._draw(tracked, result, title=title)
+        if self._files.wants_gif(index):
+            small = self._draw(tracked, result, title=time, frame=GIF_FRAME)
+        if tracked.name in self._sheet.names:
+            self._sheet.add(self._draw(tracked, result, title=tracked.name, frame=TILE_FRAME))
         with undisturbed():
+            self._write_crops(tracked, result)
             self._files.write(result)
-            if picture is not None:
-                self._files.add_picture(tracked.name, picture, tracked.time_ns)
+            self._files.add_pictures(tracked.name, picture, small, tracked.time_ns)
         self._report.add(tracked, record, min_score=self._options.shown_min_score)
         if self._options.json:
             print_json({**record, "num_points": tracked.num_points})
 
     def _gather(self, kept: KeptSweep, tracked: TrackedSweep, record: Mapping[str, Any]) -> SweepResult:
         """What belongs to a sweep, as far as the files show it."""
-        xyz, intensity = kept.take_points() if self._files.wants_points else (None, None)
+        xyz, intensity = kept.take_points() if self._wants_points(kept.name) else (None, None)
         trails: Mapping[int, np.ndarray] = {}
-        if self._files.wants_trails:
+        if self._files.wants_trails or self._sheet.names:
             assert tracked.tracks is not None
             assert tracked.T_world_sensor is not None
             trails = self._trails.add(tracked.tracks, tracked.T_world_sensor, record["time_s"])
@@ -264,21 +290,36 @@ class _Drive:
             xyz=xyz,
             intensity=intensity,
             calibration=kept.sweep.read_calibration(),
-            image=kept.sweep.read_image() if self._files.wants_image else None,
+            image=kept.sweep.read_image() if self._wants_image(kept.name) else None,
             trails=trails,
         )
 
-    def _draw(self, tracked: TrackedSweep, result: SweepResult) -> np.ndarray:
+    def _wants_image(self, name: str) -> bool:
+        return self._files.wants_image or name in self._sheet.names
+
+    def _write_crops(self, tracked: TrackedSweep, result: SweepResult) -> None:
+        if self._options.crops:
+            assert tracked.tracks is not None
+            assert result.xyz is not None
+            assert result.intensity is not None
+            folder, points = self._options.output / CROP_FOLDER, (result.xyz, result.intensity)
+            boxes = [(box.id, box) for box in tracked.tracks if box.confirmed]
+            with written(folder):
+                write_crops(folder, tracked.name, points, boxes, min_score=self._options.shown_min_score)
+
+    def _draw(
+        self, tracked: TrackedSweep, result: SweepResult, *, title: str, frame: BirdEyeFrame | None = None
+    ) -> np.ndarray:
         assert tracked.tracks is not None
         assert result.xyz is not None
-        record = result.record
         return draw_drive(
             result.xyz,
             tracked.tracks,
             image=result.image,
             calibration=result.calibration,
             trails=result.trails,
-            title=f"{tracked.name}  {record['time_s']:.1f} s  poses: {record['pose_source']}",
+            frame=frame,
+            title=title,
             min_score=self._options.shown_min_score,
         )
 

@@ -5,11 +5,13 @@ from typing import Annotated, Any
 
 import typer
 
+from jaxbox.cli.box_filter import BoxFilter, ClassesOption, WithinOption
 from jaxbox.cli.config_options import chosen_config, chosen_track_config, complete_track_setting
 from jaxbox.cli.console import input_errors
 from jaxbox.cli.options import (
     AddressOption,
     CapacityOption,
+    CropsOption,
     Engine,
     EngineOption,
     JsonOption,
@@ -20,9 +22,10 @@ from jaxbox.cli.options import (
     SensorOption,
     SetOption,
     SettingsOption,
+    SheetOption,
     TopicOption,
 )
-from jaxbox.cli.ray_engine import check_local
+from jaxbox.cli.ray_engine import check_local, check_ray
 from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.cli.track import TrackOptions, run_track
 from jaxbox.cli.track_ray import TrackRayOptions, run_track_ray
@@ -86,6 +89,11 @@ def track(
     video: Annotated[
         bool, typer.Option("--video", help="A video of each drive: from above, and the camera's image.")
     ] = False,
+    gif: Annotated[
+        bool, typer.Option("--gif", help="The same as a small animated GIF of at most 100 pictures.")
+    ] = False,
+    sheet: SheetOption = True,
+    crops: CropsOption = False,
     pictures: Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw each sweep.")] = False,
     points: Annotated[
         bool | None,
@@ -115,6 +123,8 @@ def track(
             help=f"Leave out lower scores; pictures never show less than {SHOWN_MIN_SCORE:g}.",
         ),
     ] = 0.0,
+    classes: ClassesOption = None,
+    within: WithinOption = None,
     preset: PresetOption = None,
     sensor: SensorOption = None,
     settings: SettingsOption = None,
@@ -179,7 +189,9 @@ def track(
             "quiet": quiet,
             "json": json,
         }
+        keep = BoxFilter.chosen(classes=classes, within=within)
         if engine is Engine.RAY:
+            check_ray({"--classes": classes, "--within": within, "--crops": crops, "--gif": gif})
             ray_options = TrackRayOptions(
                 output=output,
                 formats=frozenset(result_format or []),
@@ -194,6 +206,10 @@ def track(
         options = TrackOptions(
             output=pathlib.Path(output),
             formats=frozenset(result_format or [TrackFormat.KITTI]),
+            keep=keep,
+            crops=crops,
+            sheet=sheet,
+            gif=gif,
             points=True if points is None else points,
             sensor_at=sensor_at,
             level=level,

@@ -44,7 +44,9 @@ VEHICLE_TYPES = frozenset({"car", "van", "truck", "tram"} | {label.word for labe
 VEHICLE_OVERLAP = 0.5
 """What a match of vehicles must exceed: half a truck is out of sight, and nothing tells how long it is."""
 
-METRICS = ("image", "orientation", "bev", "3d")
+METRICS_IN_SPACE = ("bev", "3d")
+"""Those that need no camera."""
+METRICS = ("image", "orientation", *METRICS_IN_SPACE)
 SOFT_OVERLAPS = (0.60, 0.65, 0.70, 0.75)
 """Overlaps that `soft_score` averages over: one borderline car weighs less than at .7 alone."""
 

@@ -111,7 +111,7 @@ def evaluate_folders(
       InputError: as `read_folders`.
     """
     read = read_folders(root, results, frames=frames, missing_as_empty=missing_as_empty)
-    counted = all(sweep.calibration_path is not None for sweep in read.sweeps)
+    counted = all(sweep.is_calibrated for sweep in read.sweeps)
     report = evaluate_objects(
         read.labels,
         read.results,
@@ -121,6 +121,7 @@ def evaluate_folders(
         selections=selections,
         match_overlap=match_overlap,
         drives=drives,
+        metrics=kitti.METRICS_IN_SPACE if any(sweep.is_annotated for sweep in read.sweeps) else kitti.METRICS,
     )
     return report | {"num_missing_results": read.num_missing}
 
@@ -204,6 +205,7 @@ def evaluate_objects(
     selections: Mapping[str, matching.Selection] = SELECTIONS,
     match_overlap: float = MATCH_OVERLAP,
     drives: Mapping[str, str] | None = None,
+    metrics: Sequence[str] = kitti.METRICS,
 ) -> dict[str, Any]:
     """Measures results against labels.
 
@@ -215,6 +217,7 @@ def evaluate_objects(
       selections: what counts, by name.
       match_overlap: bird's-eye IoU from which sizes and directions are compared.
       drives: the drive of each frame, to report each by itself too.
+      metrics: as `kitti.evaluate`.
 
     Returns:
       Numbers, strings, lists, dicts and None only:
@@ -229,7 +232,7 @@ def evaluate_objects(
     """
     found = {item.type.lower() for items in results.values() for item in items} | {"car"}
     classes = {name: overlap for name, overlap in kitti.MIN_OVERLAP.items() if name.lower() in found}
-    protocol = kitti.evaluate(labels, results, min_overlap=classes, drives=drives)
+    protocol = kitti.evaluate(labels, results, min_overlap=classes, metrics=metrics, drives=drives)
     usable = {n: s for n, s in selections.items() if num_points is not None or s.min_points <= 0}
     return {
         "num_frames": len(labels),
@@ -249,7 +252,7 @@ def evaluate_objects(
 def _vehicle_curves(labels: kitti.Objects, results: kitti.Objects) -> list[dict[str, Any]]:
     merged = kitti.as_vehicles(labels), kitti.as_vehicles(results)
     overlap = {kitti.VEHICLE: kitti.VEHICLE_OVERLAP}
-    curves = kitti.evaluate(*merged, min_overlap=overlap, metrics=("bev", "3d")).curves
+    curves = kitti.evaluate(*merged, min_overlap=overlap, metrics=kitti.METRICS_IN_SPACE).curves
     return [curve.to_dict() for curve in curves]
 
 

@@ -1,6 +1,7 @@
 """Files in and out: points and recordings of every kind, data sets' layouts, labels, images, and results."""
 
 from jaxbox._files import InputError, atomic_path, atomic_writer, remove_abandoned
+from jaxbox.io.annotations import Annotation, read_annotations
 from jaxbox.io.argoverse2 import (
     read_argoverse2_boxes,
     read_argoverse2_ground,
@@ -37,7 +38,7 @@ from jaxbox.io.levelled import LevelSweeps, measure_sweeps
 from jaxbox.io.npy import read_npy, read_npz
 from jaxbox.io.nuscenes import read_nuscenes
 from jaxbox.io.pandaset import read_pandaset_boxes, read_pandaset_points
-from jaxbox.io.pcd import read_pcd
+from jaxbox.io.pcd import read_pcd, write_pcd
 from jaxbox.io.ply import read_ply
 from jaxbox.io.points import TimedPoints, read_bin, write_bin
 from jaxbox.io.pose_files import PoseFile, PoseFrame, read_pose_file
@@ -54,6 +55,7 @@ __all__ = [
     "POINT_SUFFIXES",
     "RECORDING_SUFFIXES",
     "VEHICLE_TYPES",
+    "Annotation",
     "InputError",
     "KittiObject",
     "LabelledBoxes",
@@ -75,6 +77,7 @@ __all__ = [
     "objects_from_detections",
     "objects_from_tracks",
     "open_sweeps",
+    "read_annotations",
     "read_argoverse2_boxes",
     "read_argoverse2_ground",
     "read_argoverse2_points",
@@ -113,5 +116,6 @@ __all__ = [
     "write_config",
     "write_jsonl",
     "write_labels",
+    "write_pcd",
     "write_tracks",
 ]

@@ -36,6 +36,17 @@ VEHICLE_TYPES = tuple(label.word.capitalize() for label in Label)
 MIN_VISIBLE_FRACTION = 0.1
 """Boxes with less of their 2D box in the image are not answers: the labels hold what the image shows."""
 
+ALL_ROUND = Calibration(
+    P_rect=np.zeros((3, 4), np.float32),  # pyright: ignore[reportArgumentType]
+    T_rect_velo=np.array(  # pyright: ignore[reportArgumentType]
+        [[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], np.float32
+    ),
+    image_size_px=np.zeros(2, np.int32),  # pyright: ignore[reportArgumentType]
+)
+"""In place of a camera, where labels are of all round the sensor: it sees every box whole and large. What
+KITTI measures in the image says nothing then."""
+_WHOLE_BOX_PX = (0.0, 0.0, 100.0, 100.0)
+
 # Boxes are projected in chunks of this size, the last one padded, so that one shape is compiled.
 _CHUNK = 256
 
@@ -339,9 +350,11 @@ def boxes_in_image(
     Returns:
       boxes_px: (n, 4) float64, px: left, top, right, bottom, clipped to the image; 0 where not visible.
       visible_fraction: (n,) float32, in [0, 1]: part of the 2D box that is in the image.
-      visible: (n,) bool: some of the box is before the camera and in the image.
+      visible: (n,) bool: some of the box is before the camera and in the image; all for `ALL_ROUND`.
     """
     num = len(center)
+    if not np.any(calibration.image_size_px):
+        return np.tile(_WHOLE_BOX_PX, (num, 1)), np.ones(num, np.float32), np.ones(num, bool)
     padded = np.zeros((-(-num // _CHUNK) * _CHUNK, 7), np.float32)
     padded[:num] = np.column_stack([center, size, yaw])
     parts = [(np.zeros((0, 4)), np.zeros(0, np.float32), np.zeros(0, bool))]

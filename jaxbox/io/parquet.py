@@ -4,11 +4,10 @@ Columns: ``sweep`` (its name), ``timestamp_ns`` (int64, ns since 1970, or null),
 `Label.word`, such as "car"), ``score``, ``center_x``, ``center_y``, ``center_z``, ``length``, ``width``,
 ``height`` (m, sensor frame), ``yaw`` and ``heading`` (rad), ``front_probability``, all float32, and
 ``num_points`` (int32). A sweep without boxes has no row; the names of all sweeps are a JSON list in the
-file's metadata under ``jaxbox.sweeps``. Tracks have more columns, `TRACK_COLUMNS`, also in text with commas.
+file's metadata under ``jaxbox.sweeps``. Tracks have more columns, `TRACK_COLUMNS`.
 """
 
 import contextlib
-import csv
 import json
 import pathlib
 from collections.abc import Iterator, Mapping
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from jaxbox._extras import require
-from jaxbox._files import InputError, atomic_path, atomic_writer, reason
+from jaxbox._files import InputError, atomic_path, reason
 from jaxbox.io.results import ResultFile, SweepResult, WriteResult
 
 PARQUET_COLUMNS: Mapping[str, str] = {
@@ -167,22 +166,6 @@ def finished_parquet(path: pathlib.Path) -> frozenset[str]:
         return frozenset(names)
     except (arrow.ArrowException, OSError, KeyError, ValueError, RecursionError) as error:
         raise InputError(f"{path}: no Parquet file of jaxbox ({reason(error)}); move it away.") from error
-
-
-@contextlib.contextmanager
-def open_track_csv(path: pathlib.Path) -> Iterator[WriteResult]:
-    """Opens a text file with a header and commas for the tracks of a drive; its columns are `TRACK_COLUMNS`.
-
-    Args:
-      path: the file; its folder is made where it is missing.
-
-    Yields:
-      What adds a sweep.
-    """
-    with atomic_writer(path) as handle:
-        writer = csv.DictWriter(handle, list(TRACK_COLUMNS), lineterminator="\n")
-        writer.writeheader()
-        yield lambda result: writer.writerows(box_rows(result.record))
 
 
 PARQUET = ResultFile(name="detections.parquet", open=open_parquet, finished=finished_parquet)

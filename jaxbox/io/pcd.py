@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from jaxbox._extras import require
-from jaxbox._files import InputError, check_file, reason
+from jaxbox._files import InputError, atomic_path, check_file, reason
 from jaxbox.io.point_times import timed_reader
 from jaxbox.io.points import (
     PointFormat,
@@ -47,6 +47,27 @@ def read_pcd(path: str | os.PathLike[str]) -> Points:
       ImportError: without the extra ``pcd``.
     """
     return named_points(_columns(path), str(path))
+
+
+def write_pcd(path: str | os.PathLike[str], xyz: np.ndarray, intensity: np.ndarray) -> None:
+    """Writes a binary PCD file, whole or not at all; it needs no extra.
+
+    Args:
+      path: the file; its folder is made where it is missing.
+      xyz: (n, 3) m.
+      intensity: (n,) any unit.
+
+    Raises:
+      OSError: where it cannot be written.
+    """
+    points = np.column_stack([xyz, intensity]).astype("<f4")
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\n"
+        f"TYPE F F F F\nCOUNT 1 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n"
+        f"POINTS {len(points)}\nDATA binary\n"
+    )
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(header.encode() + points.tobytes())
 
 
 def _columns(path: str | os.PathLike[str]) -> dict[str, np.ndarray]:

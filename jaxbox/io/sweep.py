@@ -7,8 +7,9 @@ import pathlib
 import numpy as np
 
 from jaxbox._files import InputError
+from jaxbox.io.annotations import is_annotations, read_annotated_objects
 from jaxbox.io.images import read_image, read_image_size
-from jaxbox.io.kitti import KittiObject, read_labels
+from jaxbox.io.kitti import ALL_ROUND, KittiObject, read_labels
 from jaxbox.io.kitti_calibration import IMAGE_SIZE_PX, read_calibration, read_raw_calibration
 from jaxbox.io.points import Points, RecordedPoints, TimedPoints
 from jaxbox.io.registry import read_points, read_timed_points
@@ -29,7 +30,7 @@ class Sweep:
     calibration_path: pathlib.Path | None = None
     """A ``calib/*.txt`` file, or for raw recordings the day's folder; None where there is none."""
     labels_path: pathlib.Path | None = None
-    """The label file; None where there is none."""
+    """The label file, KITTI's or of a tool in `jaxbox.io.annotations`; None where there is none."""
     image_path: pathlib.Path | None = None
     """The left colour camera's image; None where there is none."""
     frame: int | None = None
@@ -63,6 +64,16 @@ class Sweep:
         if self.timestamp_ns is not None and not 0 <= self.timestamp_ns < _END_OF_TIME_NS:
             object.__setattr__(self, "timestamp_ns", None)
 
+    @property
+    def is_annotated(self) -> bool:
+        """Whether its labels are those of an annotation tool, all round the sensor."""
+        return self.labels_path is not None and is_annotations(self.labels_path)
+
+    @property
+    def is_calibrated(self) -> bool:
+        """Whether it has a calibration, or needs none as its labels are all round the sensor."""
+        return self.calibration_path is not None or self.is_annotated
+
     def read_points(self) -> Points:
         """Reads the points.
 
@@ -94,13 +105,14 @@ class Sweep:
 
         Returns:
           The camera, with the image's size; or the raw calibration's size, or 1242 x 375, where there
-          is not an image. None where the sweep has no calibration.
+          is not an image. `jaxbox.io.kitti.ALL_ROUND` with labels of an annotation tool. None where the
+          sweep has no calibration.
 
         Raises:
           InputError: naming the file, where it or the image's size cannot be read.
         """
         if self.calibration_path is None:
-            return None
+            return ALL_ROUND if self.is_annotated else None
         size = None if self.image_path is None else read_image_size(self.image_path)
         if self.calibration_path.is_dir():
             return read_raw_calibration(self.calibration_path, image_size_px=size)
@@ -115,7 +127,11 @@ class Sweep:
         Raises:
           InputError: naming file and line, where it cannot be read.
         """
-        return None if self.labels_path is None else read_labels(self.labels_path, frame=self.frame)
+        if self.labels_path is None:
+            return None
+        if self.is_annotated:
+            return read_annotated_objects(self.labels_path, self.points_path.stem)
+        return read_labels(self.labels_path, frame=self.frame)
 
     def read_image(self) -> np.ndarray | None:
         """Reads the left colour camera's image.

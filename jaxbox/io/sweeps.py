@@ -9,6 +9,8 @@ Layouts are known at the dataset's root or any folder below:
   calibration files next to the drive, and the times in ``velodyne_points/timestamps.txt``
 - Argoverse 2: ``LOG/sensors/lidar/315966265259836000.feather``
 - nuScenes: ``samples/LIDAR_TOP/*.pcd.bin``
+- annotation tools: ``pointclouds`` or ``lidar_point_cloud_0`` with labels beside them, see
+  `jaxbox.io.annotations`
 - plain: a folder of point files, or one, without anything else; or recordings, which hold many sweeps.
 
 What belongs to a sweep follows from where its points lie, so it is the same however it was reached.
@@ -27,6 +29,7 @@ from collections.abc import Iterator, Sequence
 from typing import overload
 
 from jaxbox._files import InputError, check_file, read_text
+from jaxbox.io.annotations import POINT_FOLDERS, find_annotations
 from jaxbox.io.kitti import tracking_name
 from jaxbox.io.kitti_calibration import RAW_CALIBRATION_FILES
 from jaxbox.io.mcap import MCAP
@@ -50,6 +53,7 @@ _FOLDERS = (
     "training/velodyne", "training/velodyne/*",
     "data", "velodyne_points/data", "*/velodyne_points/data", "*/*/velodyne_points/data",
     "sensors/lidar", "*/sensors/lidar", "LIDAR_TOP", "samples/LIDAR_TOP",
+    "pointclouds", "lidar_point_cloud_0", "*/lidar_point_cloud_0",
 )  # fmt: skip
 """Where points may lie below a given folder, after the folder itself."""
 
@@ -254,6 +258,7 @@ def _sweep_at(file: pathlib.Path) -> Sweep:
     return Sweep(
         name=file.name[: len(file.name) - len(suffix)],
         points_path=file,
+        labels_path=find_annotations(file) if file.parent.name in POINT_FOLDERS else None,
         timestamp_ns=timestamp_ns,
         sequence=_sequence_of(file),
     )
@@ -267,6 +272,8 @@ def _sequence_of(file: pathlib.Path) -> str | None:
     folder = file.parent
     if (folder.parent.name, folder.name) == ("sensors", "lidar"):
         folder = folder.parent.parent
+    elif folder.name in POINT_FOLDERS:
+        folder = folder.parent
     # The root of a file system has no name.
     return folder.name or None
 

@@ -16,7 +16,7 @@ from jaxbox.viz.lidar_view import LidarCamera, draw_lidar_view
 from jaxbox.viz.plots import plot_dimensions, plot_residuals, save_figure
 from jaxbox.viz.stages import draw_stages
 from jaxbox.viz.tracks import draw_drive, draw_image_tracks, draw_tracks
-from jaxbox.viz.video import open_video
+from jaxbox.viz.video import open_gif, open_video
 
 __all__ = [
     "BirdEyeFrame",
@@ -37,6 +37,7 @@ __all__ = [
     "draw_tracks",
     "group_by_verdict",
     "make_contact_sheet",
+    "open_gif",
     "open_video",
     "plot_dimensions",
     "plot_residuals",

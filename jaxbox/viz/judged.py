@@ -42,7 +42,7 @@ LEGEND: tuple[tuple[str, Color], ...] = (
 """What the colours and the captions of `draw_judged_frame` mean."""
 
 VIEW_X_M, VIEW_Y_M = (-2.0, 78.0), (-30.0, 30.0)
-"""What the view from above shows: KITTI labels only what the camera sees."""
+"""What the view from above shows with a camera: KITTI labels only what it sees."""
 STRIP_PX = 26
 """Height of the line above the pictures."""
 
@@ -170,6 +170,8 @@ def _scored(item: KittiObject) -> str:
 def draw_judged_frame(frame: JudgedFrame, *, width_px: int = 1242, legend: bool = True) -> np.ndarray:
     """Draws a frame's image, where it has one, and below it the sweep from above, forward to the right.
 
+    Where the labels are all round the sensor, so is the view.
+
     Args:
       frame: what to draw.
       width_px: width of the picture.
@@ -180,7 +182,9 @@ def draw_judged_frame(frame: JudgedFrame, *, width_px: int = 1242, legend: bool 
     """
     strip = blank(width_px=width_px, height_px=STRIP_PX)
     draw_text(strip, frame.summary, (8, STRIP_PX - 8), scale=0.55)
-    view = BirdEyeFrame(x_range_m=VIEW_X_M, y_range_m=VIEW_Y_M, width_px=width_px)
+    ahead = BirdEyeFrame(x_range_m=VIEW_X_M, y_range_m=VIEW_Y_M, width_px=width_px)
+    has_camera = np.any(frame.calibration.image_size_px)
+    view = ahead if has_camera else BirdEyeFrame(width_px=width_px)
     colors = shade_by_height(frame.xyz[:, 2] + SENSOR_HEIGHT_M)
     above = draw_bird_eye(frame.xyz, colors=colors, groups=frame.groups, frame=view, legend=False)
     if legend:

@@ -1,0 +1,128 @@
+"""Which boxes a command writes and draws, by class and place: a look at the answer; nothing compiles."""
+
+import dataclasses
+import math
+import pathlib
+from collections.abc import Sequence
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+import typer
+
+from jaxbox._box_rows import MIN_CORNERS, BoxRows, in_polygon
+from jaxbox._files import InputError, finite_number, read_text
+from jaxbox.types import Label
+
+ClassesOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="CLASS,...", help=f"Only boxes of these: {', '.join(label.word for label in Label)}."
+    ),
+]
+WithinOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="AREA",
+        help="Only boxes whose centre lies in an area round the sensor, m: a radius, as 30; "
+        "X_MIN,X_MAX,Y_MIN,Y_MAX, as -10,60,-20,20; or a text file of a polygon, x y a line.",
+    ),
+]
+AnyRows = TypeVar("AnyRows", bound=BoxRows[Any])
+_RECTANGLE = 4
+
+
+@dataclasses.dataclass(frozen=True)
+class BoxFilter:
+    """Which boxes are kept.
+
+    >>> BoxFilter.chosen(classes="car,vans", within="-10,60,-20,20").recorded()
+    {'classes': ['car', 'van'], 'within': [[60.0, 20.0], [-10.0, 20.0], [-10.0, -20.0], [60.0, -20.0]]}
+    """
+
+    classes: tuple[str, ...] | None = None
+    """`Label.word` of each class; None is all."""
+    within: float | tuple[tuple[float, ...], ...] | None = None
+    """Radius from the sensor, m, or the corners of a polygon, m, sensor frame; None is everywhere."""
+
+    @classmethod
+    def chosen(cls, *, classes: str | None, within: str | None) -> "BoxFilter":
+        """The filter of two options of the command line.
+
+        Args:
+          classes: as `ClassesOption`.
+          within: as `WithinOption`.
+
+        Raises:
+          InputError: naming the option.
+        """
+        return cls(
+            None if classes is None else _parse_classes(classes),
+            None if within is None else _parse_area(within),
+        )
+
+    def recorded(self) -> dict[str, Any]:
+        """The filter as JSON can hold it, for the account of the run."""
+        area = self.within if not isinstance(self.within, tuple) else [list(corner) for corner in self.within]
+        return {"classes": None if self.classes is None else list(self.classes), "within": area}
+
+    def __call__(self, boxes: AnyRows) -> AnyRows:
+        """The boxes with the others no longer valid: shapes and rows stay.
+
+        Args:
+          boxes: of one sweep, on the host.
+        """
+        keep = np.array(boxes.valid)
+        center = np.asarray(boxes.center, np.float64)
+        if self.classes is not None:
+            keep &= np.isin(boxes.label, [label.value for label in Label if label.word in self.classes])
+        if isinstance(self.within, tuple):
+            keep &= in_polygon(center, self.within)
+        elif self.within is not None:
+            keep &= np.hypot(center[:, 0], center[:, 1]) <= self.within
+        return dataclasses.replace(boxes, valid=keep)  # pyright: ignore[reportArgumentType]
+
+
+def _parse_classes(text: str) -> tuple[str, ...]:
+    known = {name: label.word for label in Label for name in (label.word, label.plural)}
+    words = [word.strip().lower() for word in text.split(",")]
+    if unknown := [word for word in words if word not in known]:
+        names = ", ".join(label.word for label in Label)
+        raise InputError(f"--classes {text}: {unknown[0]!r} is none; choose from {names}.")
+    return tuple(label.word for label in Label if label.word in {known[word] for word in words})
+
+
+def _parse_area(text: str) -> float | tuple[tuple[float, ...], ...]:
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        return _read_polygon(text)
+    if not all(map(math.isfinite, numbers)):
+        raise InputError(f"--within {text}: give finite numbers, in metres.")
+    if len(numbers) == 1 and numbers[0] > 0:
+        return numbers[0]
+    if len(numbers) == _RECTANGLE and numbers[0] < numbers[1] and numbers[2] < numbers[3]:
+        x_min, x_max, y_min, y_max = numbers
+        return ((x_max, y_max), (x_min, y_max), (x_min, y_min), (x_max, y_min))
+    raise InputError(
+        f"--within {text}: give a radius above 0, or X_MIN,X_MAX,Y_MIN,Y_MAX with each least before its "
+        "greatest, in metres."
+    )
+
+
+def _read_polygon(text: str) -> tuple[tuple[float, ...], ...]:
+    if not pathlib.Path(text).is_file():
+        raise InputError(
+            f"--within {text}: neither numbers nor a file; give a radius, X_MIN,X_MAX,Y_MIN,Y_MAX, or a text "
+            "file with a corner a line, x y."
+        )
+    rows = enumerate(read_text(text).replace(",", " ").splitlines(), start=1)
+    corners = [_parse_corner(line.split(), f"{text}, line {row}") for row, line in rows if line.strip()]
+    if len(corners) < MIN_CORNERS:
+        raise InputError(f"{text}: {len(corners)} corners; a polygon has at least three, x y a line.")
+    return tuple(corners)
+
+
+def _parse_corner(words: Sequence[str], where: str) -> tuple[float, float]:
+    if len(words) != 2:
+        raise InputError(f"{where}: {len(words)} numbers; a corner is x y, in metres.")
+    return finite_number(words[0], "x", where), finite_number(words[1], "y", where)
