@@ -170,3 +170,22 @@ def test_the_pages_of_the_navigation_are_the_pages_that_exist():
     made = set(hook("project_pages").PAGES.values())
     docs = PROJECT / "docs"
     assert named - made == {path.relative_to(docs).as_posix() for path in docs.rglob("*.md")}
+
+
+def test_the_page_of_other_sensors_has_the_recorded_counts():
+    page = " ".join((PROJECT / "docs" / "my_sensor.md").read_text().split())
+    figures = hook("figures")
+    report = figures.load("sensors")
+    found = {name: report[name]["recall"]["cars"] for name in ("argoverse2", "pandaset", "semantic_kitti")}
+    for name, words in (
+        ("argoverse2", "Argoverse 2"),
+        ("pandaset", "PandaSet"),
+        ("semantic_kitti", "SemanticKITTI"),
+    ):
+        assert re.search(rf"{found[name]['found']} of {found[name]['wanted']}(?: cars)? \({words}\)", page)
+    cut = next(row for row in report["pooled"]["cuts"] if row["min_score"] == report["pooled"]["library_cut"])
+    assert (
+        f"{100 * cut['precision']:.0f} of 100 boxes from a score of {cut['min_score']:g}".replace("0.", ".")
+        in page
+    )
+    assert "| 64 | 0.981 | 0.981 |" in figures.beams_recall()

@@ -149,14 +149,28 @@ def test_the_scene_has_the_edges_of_the_boxes_and_the_hulls_of_their_points(fram
 def test_the_scene_has_the_labels_where_the_vehicles_are(frame, detections):
     scene = build_scene(frame, detections, View(min_score=SOME))
     found = BoxSet.from_detections(detections, min_score=SOME)
-    hit, _ = find_matches(found, frame.vehicles)
+    hit, was_found = find_matches(found, frame.vehicles)
     assert hit.sum() >= 2, "boxes and labels are in one frame"
     np.testing.assert_allclose(
         scene.lines["labels"].segments, frame.vehicles.segments().reshape(-1, 2, 3), rtol=1e-6
     )
+    # One caption an object: labels that a box stands for are not named again.
     texts = [caption.text for caption in scene.captions]
-    assert texts == [*found.captions, *frame.vehicles.captions, "Pedestrian"]
+    alone = [name for name, seen in zip(frame.vehicles.captions, was_found, strict=True) if not seen]
+    assert texts[len(found) :] == [*(f"label: {name}" for name in alone), "label: Pedestrian"]
+    assert [text.split(" (label")[0] for text in texts[: len(found)]] == list(found.captions)
     assert [caption.below for caption in scene.captions] == [row >= len(found) for row in range(len(texts))]
+
+
+def test_a_box_names_the_label_of_another_class_that_it_stands_for(frame, detections):
+    boxes = BoxSet.from_detections(detections, min_score=SOME)
+    row = int(np.flatnonzero([text.startswith("car") for text in boxes.captions])[0])
+    for name, said in (("Car", boxes.captions[row]), ("Van", f"{boxes.captions[row]} (label: Van)")):
+        label = dataclasses.replace(boxes.take(np.array([row])), captions=(name,))
+        labelled = dataclasses.replace(frame, vehicles=label, others=None)
+        captions = build_scene(labelled, detections, View(min_score=SOME)).captions
+        assert len(captions) == len(boxes)
+        assert captions[row].text == said
 
 
 def test_each_switch_takes_its_own_away(frame, detections):
@@ -361,10 +375,11 @@ class FakePage:
 
     def __init__(self):
         self.changed = threading.Condition()
-        self.scenes, self.answers, self.followed = [], [], []
+        self.scenes, self.compared, self.answers, self.followed = [], [], [], []
 
-    def show_scene(self, scene):
+    def show_scene(self, scene, compared=None):
         self.scenes.append(scene)
+        self.compared.append(compared)
 
     def show_words(self, answer, *, status="", points=""):
         with self.changed:

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.browser
 
 SHOWN = 0.05
 """These streets are sparse, and their boxes score low."""
-VIEW_PX = (370, 610)
+VIEW_PX = (370, 590)
 """Rows and columns of the 3D view that no panel covers: their headings are yellow too."""
 
 
@@ -64,6 +64,11 @@ def hue_saturation_value(picture):
     return cv2.cvtColor(np.asarray(picture, np.uint8), cv2.COLOR_RGB2HSV).astype(int)
 
 
+def brightness(visit):
+    """Mean of the 3D view, 0 to 255."""
+    return float(visit.picture()[: VIEW_PX[0], : VIEW_PX[1]].mean())
+
+
 def box_pixels(visit):
     """Pixels of the 3D view in the hue of the boxes: where no graphics card draws, thin lines are blended."""
     hue, saturation, value = np.moveaxis(
@@ -92,12 +97,12 @@ def test_the_page_shows_the_boxes(visit):
 def test_a_slider_detects_anew_and_compiles_nothing(visit):
     compiles, many = visit.number("compiles"), visit.number("vehicles")
     assert compiles >= 1
-    visit.drag("points from", 0.5)
+    visit.drag("fewest points", 0.5)
     visit.wait(lambda: visit.number("vehicles") < many)
     few = visit.number("vehicles")
-    visit.drag("points from", 0.0)
+    visit.drag("fewest points", 0.0)
     visit.wait(lambda: visit.number("vehicles") > few)
-    visit.type_value("overlap to", 1.0)
+    visit.type_value("greatest overlap", 1.0)
     visit.wait(lambda: visit.number("vehicles") > many)
     visit.press("reset")
     visit.wait(lambda: visit.number("vehicles") == many)
@@ -113,7 +118,7 @@ def test_the_shown_score_hides_boxes(visit):
 
 def test_a_preset_compiles_once_and_sets_the_sliders(visit):
     compiles = visit.number("compiles")
-    tolerance = visit.control("tolerance (m)").locator("xpath=following-sibling::*//input")
+    tolerance = visit.control("plane tolerance").locator("xpath=following-sibling::*//input")
     assert tolerance.input_value() == "0.1"
     visit.choose("preset", "paper")
     visit.wait(lambda: visit.number("vehicles") == num_boxes(0, config=DetectorConfig.paper()))
@@ -127,8 +132,8 @@ def test_a_preset_compiles_once_and_sets_the_sliders(visit):
 
 def test_the_settings_are_copied_and_downloaded(visit, served, tmp_path):
     viewer, _ = served
-    visit.type_value("points from", 12.0)
-    visit.type_value("growth (1/m)", 0.01)
+    visit.type_value("fewest points", 12.0)
+    visit.type_value("link growth", 0.01)
     wanted = {"clustering.min_points": 12.0, "clustering.adaptive_growth": 0.01}
     visit.wait(lambda: viewer.wanted.changes == wanted)
     visit.press("copy")
@@ -159,3 +164,29 @@ def test_the_timeline_passes_over_a_sweep_that_cannot_be_read(visit):
     visit.wait(lambda: visit.text("name") == "000002")
     visit.press("pause")
     visit.page.get_by_role("button", name="play", exact=True).wait_for()
+
+
+def test_a_click_on_a_row_flies_to_its_box(visit):
+    visit.tab("Boxes")
+    rows = visit.page.locator("[data-box]")
+    visit.wait(lambda: rows.count() == visit.number("vehicles"))
+    before = visit.picture()[: VIEW_PX[0], : VIEW_PX[1]].astype(int)
+    visit.page.locator("[data-box='2']").click()
+    # The hidden buttons of the same numbers fly; the legend stays where it is.
+    visit.wait(lambda: np.abs(visit.picture()[: VIEW_PX[0], : VIEW_PX[1]] - before).mean() > 5)
+    assert "box" in visit.text("legend")
+
+
+def test_the_page_turns_light_and_dark_again(visit):
+    assert brightness(visit) < 100
+    visit.tab("View")
+    light = visit.page.get_by_label("light page", exact=True)
+    light.check()
+    visit.wait(lambda: brightness(visit) > 180)
+    light.uncheck()
+    visit.wait(lambda: brightness(visit) < 100)
+
+
+def test_a_threshold_explains_itself_under_the_mouse(visit):
+    visit.control("obstacles up to").hover()
+    visit.page.get_by_text("Setting: ground.max_height_m").wait_for()

@@ -293,7 +293,7 @@ def test_the_command_begins_with_tracks(folder, monkeypatch):
     asked = []
 
     def interrupted(viewer):
-        asked.append((viewer.wanted.view.tracks, [len(drive) for drive in viewer._tracks._drives]))
+        asked.append((viewer.wanted.view.tracks, [len(drive) for drive in viewer._side.tracks._drives]))
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Viewer, "run", interrupted)
@@ -310,9 +310,9 @@ def test_a_real_page_draws_tracks_each_line_in_its_colour(folder):
         page = viewer._page
         assert page._view_controls["tracks"].value
         assert "data-jaxbox='tracks'" in page._answer.content
-        boxes = page._nodes["boxes"]
+        boxes = page._canvas.nodes["boxes"]
         assert boxes.colors.shape == boxes.points.shape
         assert len(np.unique(boxes.colors.reshape(-1, 3), axis=0)) == len(boxes.points) / 12
-        assert "trails" in page._nodes
+        assert "trails" in page._canvas.nodes
         viewer.answer(dataclasses.replace(wanted, view=View()))
-        assert "trails" not in page._nodes, "nothing of the tracks is left"
+        assert "trails" not in page._canvas.nodes, "nothing of the tracks is left"

@@ -51,6 +51,7 @@ def _take(url: str, path: pathlib.Path) -> None:
         while notice.count():
             notice.first.click()
             visit.page.wait_for_timeout(500)
+        visit.tab("Boxes")
         visit.page.mouse.move(SIZE_PX[0] // 2, 20)
         visit.page.wait_for_timeout(SETTLE_MS)
         picture = Image.fromarray(visit.picture())

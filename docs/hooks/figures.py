@@ -334,6 +334,18 @@ def beams() -> str:
     return table(list(report["kitti"][0]), rows) + made_with(report)
 
 
+def beams_recall() -> str:
+    """Recall by number of beams on the drives that chose no settings of theirs."""
+    report = load("beams")
+    held_out = [row for row in report["kitti"] if row["drives"] == "held-out drives"]
+    found = {(row["sensor"], row["preset for"]): row["recall bev 0.5"] for row in held_out}
+    beams = sorted({sensor for sensor, _ in found}, reverse=True)
+    rows = [(n, found[n, "64 beams"], found[n, f"{n} beams"]) for n in beams]
+    return table(["beams over 27 degrees", "recall, default preset", "with `--sensor`"], rows) + made_with(
+        report
+    )
+
+
 def beams_synthetic() -> str:
     """The same on ray-cast streets."""
     rows = load("beams")["synthetic"]
@@ -689,6 +701,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "cluster": cluster,
     "archives": archives,
     "beams": beams,
+    "beams_recall": beams_recall,
     "beams_synthetic": beams_synthetic,
     "mounting": mounting,
     "situations": situations,

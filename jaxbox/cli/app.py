@@ -73,6 +73,8 @@ jaxbox view drive.bag --topic /velodyne_points --preset fast
 
 jaxbox view 'clouds/*.pcd' --config my.toml --port 0 --open
 
+jaxbox view drive.bag --compare fast
+
 """
 
 app = typer.Typer(
@@ -364,6 +366,11 @@ def view(
     track: Annotated[
         bool, typer.Option("--track", help="Show tracks: ids, states, trails. The page has a switch, too.")
     ] = False,
+    compare: Annotated[
+        str | None,
+        typer.Option(metavar="PRESET|FILE|PATH", help="Other settings or sweeps to show beside these."),
+    ] = None,
+    light: Annotated[bool, typer.Option("--light", help="A light page; it has a switch, too.")] = False,
     preset: PresetOption = None,
     sensor: SensorOption = None,
     settings: SettingsOption = None,
@@ -394,5 +401,8 @@ def view(
             min_score=min_score,
             track=track,
             open_browser=open_browser,
+            light=light,
+            compare=compare,
+            sensor=sensor,
         )
         raise typer.Exit(run_view(paths, options, stdout()))

@@ -9,7 +9,7 @@ from jaxbox.viewer.config_text import config_text
 from jaxbox.viewer.drives import TrackedFrame, TrackMemory
 from jaxbox.viewer.frames import Frame, Frames
 from jaxbox.viewer.scene import COLORINGS, Scene, View, build_scene
-from jaxbox.viewer.serving import open_viewer
+from jaxbox.viewer.serving import Comparison, open_viewer
 from jaxbox.viewer.session import Session, Shown
 from jaxbox.viewer.thresholds import THRESHOLDS, Threshold
 from jaxbox.viewer.viewer import Viewer, Wanted
@@ -17,6 +17,7 @@ from jaxbox.viewer.viewer import Viewer, Wanted
 __all__ = [
     "COLORINGS",
     "THRESHOLDS",
+    "Comparison",
     "Frame",
     "Frames",
     "Scene",

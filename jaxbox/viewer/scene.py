@@ -12,6 +12,7 @@ from jaxbox.viewer.frames import Frame
 from jaxbox.viewer.motion import motion_lines, shown_groups
 from jaxbox.viewer.space import Caption, Lines, colored_edges, edges
 from jaxbox.viz import BoxGroup, BoxSet, color_by_height, color_by_id, draw_image_boxes
+from jaxbox.viz.boxes import bird_eye_iou, find_matches
 from jaxbox.viz.colors import ESTIMATE, HULL, IGNORED, TRUTH, Color, shade_by_height
 from jaxbox.viz.stages import height_above_plane
 
@@ -21,6 +22,11 @@ OBSTACLE_COLOR: Color = (120, 215, 255)
 """Points above it."""
 CAPTION_GAP_M = 0.3
 """Distance of captions above their boxes, and of those of labels below, so that neither hides the other."""
+COMPARED: Color = (240, 120, 255)
+"""Boxes of what is compared."""
+LIGHT_SHARE = 0.7
+"""On a light page colours are darker by this factor: they are made for a dark one."""
+_TITLE_M = 2.0
 _INTENSITY_TOP = 99.0
 """Percentile of the intensities that has the highest colour: a few mirrors outshine everything."""
 _LOW_PERCENTILE = 5.0
@@ -45,6 +51,10 @@ class View:
     """Whether labelled boxes are drawn."""
     tracks: bool = False
     """Whether the boxes are those of tracks, by id, with their trails and velocities."""
+    light: bool = False
+    """Whether the page is light, and not dark."""
+    apart_m: float = 0.0
+    """Distance to the right at which what is compared is drawn, m; 0 for the same place."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -59,15 +69,30 @@ class Scene:
     """By name: ``boxes``, ``hulls``, ``labels`` and ``other_labels``; of tracks ``trails`` and ``arrows``
     too; some may be empty."""
     captions: tuple[Caption, ...]
-    """Class and score of each box, or id and state of its track, and the type of each label."""
+    """One an object: class and score of a box, or id and state of its track, or the type of a label alone."""
     image: np.ndarray | None
     """(h, w, 3) uint8: the camera's image with the boxes, where there is one."""
-    num_boxes: int
-    """Boxes drawn, or that would be were they not switched off."""
+    boxes: BoxSet
+    """Those drawn, or that would be were they not switched off."""
+    view: View
+    """What was to be seen."""
+    title: str = ""
+    """What it is a scene of, where another is compared with it."""
+
+    @property
+    def num_boxes(self) -> int:
+        """Boxes drawn, or that would be were they not switched off."""
+        return len(self.boxes)
 
 
 def build_scene(
-    frame: Frame, detections: Detections | None, view: View, tracked: TrackedFrame | None = None
+    frame: Frame,
+    detections: Detections | None,
+    view: View,
+    tracked: TrackedFrame | None = None,
+    *,
+    title: str = "",
+    compared: bool = False,
 ) -> Scene:
     """Puts the arrays together.
 
@@ -77,6 +102,8 @@ def build_scene(
       view: what is to be seen.
       tracked: its tracks, which take the place of the boxes where the view wants them; None where there are
         none.
+      title: what it is a scene of, where another is compared with it.
+      compared: whether it is that other scene, whose boxes have a colour of their own and captions below.
 
     Returns:
       The scene.
@@ -89,6 +116,8 @@ def build_scene(
     if view.tracks and tracked is not None:
         by_row = shown_groups(tracked, min_score=view.min_score)
         groups, motion = list(by_row.values()), motion_lines(tracked, by_row)
+    if compared:
+        groups = [dataclasses.replace(group, color=COMPARED) for group in groups]
     shown = groups if view.boxes else []
     hulls = [] if detections is None or not view.hulls else _hull_lines(detections, found, view.min_score)
     vehicles, others = (
@@ -102,20 +131,54 @@ def build_scene(
         "other_labels": Lines(segments=edges(others), color=IGNORED),
         **motion,
     }
-    captions = [caption for group in shown for caption in _captions(group.boxes)]
-    captions += [*_captions(vehicles, below=True), *_captions(others, below=True)]
+    boxes = _joined(groups)
+    captions = _all_captions(boxes if view.boxes else _no_boxes(), vehicles, others, below=compared)
+    titles = [Caption(text=title, position=(0.0, 0.0, _TITLE_M))] if title and view.apart_m else []
     return Scene(
         points=frame.xyz,
-        colors=COLORINGS[view.coloring](frame, detections, view),
-        lines=lines,
-        captions=tuple(captions if view.captions else ()),
+        colors=on_page(COLORINGS[view.coloring](frame, detections, view), view),
+        lines={
+            name: Lines(segments=drawn.segments, color=on_page(drawn.color, view))
+            for name, drawn in lines.items()
+        },
+        captions=(*(captions if view.captions else ()), *titles),
         image=_camera_picture(frame, shown, vehicles, others),
-        num_boxes=sum(len(group.boxes) for group in groups),
+        boxes=boxes,
+        view=view,
+        title=title,
     )
+
+
+def on_page(colors: Color | np.ndarray, view: View) -> np.ndarray:
+    """Colours as a page shows them.
+
+    Args:
+      colors: (..., 3) uint8, for a dark page.
+      view: says whether the page is light.
+
+    Returns:
+      (..., 3) uint8: the same, or darker by `LIGHT_SHARE`.
+
+    >>> on_page((200, 100, 0), View(light=True)).tolist()
+    [140, 70, 0]
+    """
+    colors = np.asarray(colors, np.uint8)
+    return np.round(LIGHT_SHARE * colors).astype(np.uint8) if view.light else colors
 
 
 def _no_boxes() -> BoxSet:
     return BoxSet(center=np.zeros((0, 3)), size=np.zeros((0, 3)), yaw=np.zeros(0))
+
+
+def _joined(groups: list[BoxGroup]) -> BoxSet:
+    """The boxes of all groups."""
+    sets = [_no_boxes(), *(group.boxes for group in groups)]
+    return BoxSet(
+        center=np.concatenate([boxes.center for boxes in sets]),
+        size=np.concatenate([boxes.size for boxes in sets]),
+        yaw=np.concatenate([boxes.yaw for boxes in sets]),
+        captions=tuple(caption for boxes in sets for caption in boxes.captions),
+    )
 
 
 def _stacked(segments: list[np.ndarray]) -> np.ndarray:
@@ -141,6 +204,24 @@ def _ring(polygon: np.ndarray, z: float) -> np.ndarray:
     """(h, 2, 3): the sides of a polygon at a height."""
     corners = np.column_stack([polygon, np.full(len(polygon), z)])
     return np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+
+
+def _all_captions(boxes: BoxSet, vehicles: BoxSet, others: BoxSet, *, below: bool) -> list[Caption]:
+    """One an object: a label in the place of a box is in that box's caption, where it says anything else."""
+    (hit, found), iou = find_matches(boxes, vehicles), bird_eye_iou(boxes, vehicles)
+    texts = list(boxes.captions)
+    for row in np.flatnonzero(hit).tolist():
+        label, word = vehicles.captions[iou[row].argmax()], texts[row].split()[0]
+        # A track's caption begins with its id.
+        if word.isalpha() and label.lower() != word:
+            texts[row] += f" (label: {label})"
+    captions = _captions(dataclasses.replace(boxes, captions=tuple(texts)), below=below)
+    alone = [vehicles.take(~found), others]
+    return captions + [
+        dataclasses.replace(caption, text=f"label: {caption.text}")
+        for labels in alone
+        for caption in _captions(labels, below=True)
+    ]
 
 
 def _captions(boxes: BoxSet, *, below: bool = False) -> list[Caption]:

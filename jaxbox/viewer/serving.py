@@ -1,18 +1,34 @@
 """A viewer behind an address: server, page, session and loop put together."""
 
 import contextlib
+import dataclasses
 from collections.abc import Iterator, Sequence
 
 from jaxbox import io
+from jaxbox.config import DetectorConfig
 from jaxbox.viewer.drives import TrackMemory, split_drives
 from jaxbox.viewer.frames import Frames
 from jaxbox.viewer.page import ViserPage
 from jaxbox.viewer.server import open_server, page_url, quiet
 from jaxbox.viewer.session import Session
-from jaxbox.viewer.viewer import Viewer, Wanted
+from jaxbox.viewer.viewer import Side, Viewer, Wanted
 
 LOOPBACK = "127.0.0.1"
 """Reached from this machine only."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """What a page shows beside its sweeps: other sweeps, or the same with other settings."""
+
+    title: str
+    """What it is, in a few words."""
+    config: DetectorConfig | None = None
+    """Settings; None for those of the page."""
+    sweeps: Sequence[io.Sweep] | None = None
+    """Sweeps, which are shown by number: the first with the first; None for those of the page."""
+    of: str = ""
+    """What it is compared with, in a few words; empty for the page's preset."""
 
 
 @contextlib.contextmanager
@@ -23,6 +39,7 @@ def open_viewer(
     host: str = LOOPBACK,
     port: int = 0,
     capacity: int | None = None,
+    comparison: Comparison | None = None,
 ) -> Iterator[tuple[Viewer, str]]:
     """Serves a page while the block runs; in it, `Viewer.run` answers what the page's user asks for.
 
@@ -32,6 +49,7 @@ def open_viewer(
       host: name or address to listen at.
       port: 0 takes a free one.
       capacity: points that a sweep is padded to; None for what it needs.
+      comparison: what is shown with it; None for nothing.
 
     Yields:
       The viewer, and the address of its page.
@@ -43,12 +61,29 @@ def open_viewer(
     wanted = Wanted() if wanted is None else wanted
     server = open_server(host=host, port=port)
     try:
-        ordered, drives = split_drives(sweeps)
-        page = ViserPage(server, wanted, num_sweeps=len(ordered))
-        with contextlib.closing(TrackMemory(drives, capacity=capacity)) as tracks:
-            viewer = Viewer(Session(Frames(ordered, capacity=capacity)), page, wanted, tracks=tracks)
+        with contextlib.ExitStack() as stack:
+            side = _side(sweeps, capacity, stack)
+            compared = None if comparison is None else _compared_side(comparison, sweeps, capacity, stack)
+            page = ViserPage(server, wanted, num_sweeps=len(side.session), compares=compared is not None)
+            title = "" if comparison is None else comparison.of
+            viewer = Viewer(side.session, page, wanted, tracks=side.tracks, title=title, compared=compared)
             page.connect(viewer)
             yield viewer, page_url(server)
     finally:
         with quiet():
             server.stop()
+
+
+def _side(sweeps: Sequence[io.Sweep], capacity: int | None, stack: contextlib.ExitStack) -> Side:
+    """Sweeps with a detector and a memory of tracks, which the stack closes."""
+    ordered, drives = split_drives(sweeps)
+    tracks = stack.enter_context(contextlib.closing(TrackMemory(drives, capacity=capacity)))
+    return Side(session=Session(Frames(ordered, capacity=capacity)), tracks=tracks)
+
+
+def _compared_side(
+    comparison: Comparison, sweeps: Sequence[io.Sweep], capacity: int | None, stack: contextlib.ExitStack
+) -> Side:
+    is_same = comparison.sweeps is None
+    side = _side(sweeps if comparison.sweeps is None else comparison.sweeps, capacity, stack)
+    return dataclasses.replace(side, title=comparison.title, config=comparison.config, same_sweeps=is_same)

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping
 
 from jaxbox.config import DetectorConfig
-from jaxbox.config.fields import traced_fields
+from jaxbox.config.fields import traced_fields, traced_ranges
 
 
 def _always(_: DetectorConfig) -> bool:
@@ -47,8 +47,22 @@ class Threshold:
     """Right end."""
     step: float
     """Between two stops."""
+    unit: str = ""
+    """Of its numbers; empty for those that have none."""
     matters: Callable[[DetectorConfig], bool] = _always
     """Whether settings use it at all: some presets leave the stage out."""
+
+    @property
+    def tooltip(self) -> str:
+        """What it does, its unit, the numbers that it takes, and its name in settings files.
+
+        >>> THRESHOLDS["ground"][1].tooltip.split("are ")[1]
+        'obstacles. In m; a finite number. Setting: ground.min_height_m.'
+        """
+        unit = f"In {self.unit}; " if self.unit else ""
+        allowed = traced_ranges(DetectorConfig())[self.name].text
+        text = unit + allowed
+        return f"{self.hint} {text[0].upper()}{text[1:]}. Setting: {self.name}."
 
     def value(self, config: DetectorConfig) -> float:
         """What settings have for it.
@@ -63,7 +77,8 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
     "filter": (
         Threshold(
             name="filtering.num_std",
-            label="deviations",
+            label="outlier distance",
+            unit="standard deviations",
             hint="A point farther from its centroid than the mean and that many deviations is an outlier.",
             low=0.5,
             high=16.0,
@@ -72,7 +87,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="filtering.min_density",
-            label="density",
+            label="least density",
             hint="Points with less weight of points round them are outliers; a point alone weighs 1.",
             low=0.0,
             high=10.0,
@@ -83,7 +98,8 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
     "ground": (
         Threshold(
             name="ground.tolerance_m",
-            label="tolerance (m)",
+            label="plane tolerance",
+            unit="m",
             hint="A candidate within this of a plane speaks for it.",
             low=0.01,
             high=0.5,
@@ -91,7 +107,8 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="ground.min_height_m",
-            label="from height (m)",
+            label="obstacles from",
+            unit="m",
             hint="Points higher above the ground than this are obstacles.",
             low=0.0,
             high=1.0,
@@ -99,7 +116,8 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="ground.max_height_m",
-            label="to height (m)",
+            label="obstacles up to",
+            unit="m",
             hint="Points higher above the ground than this are overhead, and dropped.",
             low=1.0,
             high=8.0,
@@ -107,7 +125,8 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="ground.max_grade",
-            label="grade (m/m)",
+            label="steepest ground",
+            unit="m/m",
             hint="Steepest rise of the ground relative to its plane.",
             low=0.0,
             high=0.3,
@@ -118,7 +137,8 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
     "clusters": (
         Threshold(
             name="clustering.min_points",
-            label="points from",
+            label="fewest points",
+            unit="points",
             hint="Clusters with fewer points are dropped.",
             low=1.0,
             high=100.0,
@@ -126,7 +146,8 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="clustering.max_extent_m",
-            label="extent to (m)",
+            label="greatest length",
+            unit="m",
             hint="Clusters longer than this along x or y are dropped.",
             low=2.0,
             high=30.0,
@@ -134,7 +155,8 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="clustering.adaptive_start_m",
-            label="grows from (m)",
+            label="links grow from",
+            unit="m",
             hint="Range from which the linking distance grows.",
             low=0.0,
             high=60.0,
@@ -142,7 +164,8 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="clustering.adaptive_growth",
-            label="growth (1/m)",
+            label="link growth",
+            unit="1/m",
             hint="Growth of the linking distance with range; 0 keeps it fixed.",
             low=0.0,
             high=0.05,
@@ -152,7 +175,8 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
     "boxes": (
         Threshold(
             name="box.slab_min_height_m",
-            label="slab from (m)",
+            label="outline from",
+            unit="m",
             hint="Only points higher above the ground than this shape the rectangle.",
             low=0.0,
             high=1.0,
@@ -161,7 +185,8 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="box.slab_max_height_m",
-            label="slab to (m)",
+            label="outline up to",
+            unit="m",
             hint="Only points lower above the ground than this shape the rectangle.",
             low=0.3,
             high=3.0,
@@ -170,7 +195,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="completion.free_length_weight",
-            label="free area",
+            label="cost of free area",
             hint="Cost of the share of a box that the beams have seen to be free.",
             low=0.0,
             high=8.0,
@@ -179,7 +204,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="completion.seen_weight",
-            label="seen sides",
+            label="trust in seen sides",
             hint="What the measured size of a side seen whole weighs against the class's usual size.",
             low=0.0,
             high=1.0,
@@ -190,7 +215,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
     "score": (
         Threshold(
             name="vehicles.min_score",
-            label="score from",
+            label="least score",
             hint="Boxes with lower scores are dropped.",
             low=0.0,
             high=1.0,
@@ -198,7 +223,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="vehicles.max_overlap",
-            label="overlap to",
+            label="greatest overlap",
             hint="Of two boxes that overlap more (intersection over union from above), the better stays.",
             low=0.0,
             high=1.0,
@@ -206,7 +231,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="vehicles.free_scale",
-            label="free rays",
+            label="tolerated free rays",
             hint="The smaller, the more it costs a box that rays pass through it.",
             low=0.01,
             high=1.0,
@@ -215,7 +240,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="vehicles.ring_weight",
-            label="ring",
+            label="cost of neighbours",
             hint="What points just outside a box cost it.",
             low=0.0,
             high=40.0,
@@ -223,7 +248,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="vehicles.upright_score",
-            label="upright",
+            label="score of walls",
             hint="Factor of the score where all upper points are on the faces, as a wall's or a hedge's are.",
             low=0.0,
             high=1.0,
@@ -231,7 +256,7 @@ THRESHOLDS: Mapping[str, tuple[Threshold, ...]] = {
         ),
         Threshold(
             name="vehicles.objective_gate",
-            label="objective",
+            label="worst fit to beams",
             hint="Boxes that explain the beams worse than this score low.",
             low=0.0,
             high=6.0,

@@ -4,11 +4,12 @@ The page's events only record what is requested; one thread answers. While it de
 is kept: a slider that is dragged shows as many results as there is time for, and none of them late.
 """
 
+import contextlib
 import dataclasses
 import threading
 import time
 import traceback
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
 from jaxbox.config import DetectorConfig
@@ -16,7 +17,7 @@ from jaxbox.config.fields import preset_config, replace_fields
 from jaxbox.io import InputError
 from jaxbox.viewer import words
 from jaxbox.viewer.config_text import config_text
-from jaxbox.viewer.drives import TrackMemory
+from jaxbox.viewer.drives import TrackedFrame, TrackMemory
 from jaxbox.viewer.frames import Frame
 from jaxbox.viewer.scene import Scene, View, build_scene
 from jaxbox.viewer.session import Session, Shown
@@ -24,7 +25,7 @@ from jaxbox.viewer.session import Session, Shown
 SWEEPS_PER_S = 10.0
 """Rate of playing to begin with: that of most sensors."""
 TELL_S = 0.3
-"""Tracking that takes longer than this tells how far it is, s."""
+"""Work that takes longer than this tells how far it is, and again so often, s."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -58,16 +59,46 @@ class Wanted:
         return replace_fields(base, self.changes)
 
     @property
+    def title(self) -> str:
+        """The settings in a few words: the preset, and whether thresholds differ from it."""
+        return (self.preset or "given") + (", changed" if self.changes else "")
+
+    @property
     def config_text(self) -> str:
         """The settings as TOML, see `jaxbox.viewer.config_text`."""
         return config_text(self.config, self.preset, min_score=self.view.min_score)
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Side:
+    """Sweeps, and who detects in them: those of a page, or those that it compares with them."""
+
+    session: Session
+    """The sweeps and the detector."""
+    tracks: TrackMemory | None = None
+    """Their tracks, where there can be any."""
+    title: str = ""
+    """What it is, where two are compared; empty for the name of the preset."""
+    config: DetectorConfig | None = None
+    """Settings that the page does not change; None for those of the page."""
+    same_sweeps: bool = False
+    """Whether its sweeps are those that it is compared with."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Answer:
+    """What there is to show of one side."""
+
+    shown: Shown
+    tracked: TrackedFrame | None
+    problems: list[str]
+
+
 class Page(Protocol):
     """What the loop needs of a page."""
 
-    def show_scene(self, scene: Scene | None) -> None:
-        """Draws a scene, or nothing."""
+    def show_scene(self, scene: Scene | None, compared: Scene | None = None) -> None:
+        """Draws a scene, and one that is compared with it; or nothing."""
 
     def show_words(self, answer: str, *, status: str = "", points: str = "") -> None:
         """Shows texts, HTML."""
@@ -86,8 +117,11 @@ class Viewer:
         wanted: Wanted | None = None,
         *,
         tracks: TrackMemory | None = None,
+        title: str = "",
+        compared: Side | None = None,
     ) -> None:
-        self._session, self._page, self._tracks = session, page, tracks
+        self._session, self._page = session, page
+        self._side, self._compared = Side(session=session, tracks=tracks, title=title), compared
         self._changed = threading.Condition()
         self._wanted = Wanted() if wanted is None else wanted
         self._answered: Wanted | None = None
@@ -178,59 +212,129 @@ class Viewer:
             return None if self._stopped else self._wanted
 
     def _show(self, wanted: Wanted) -> None:
-        frame = self._session.frame(wanted.index)
-        config = wanted.config
-        if not self._session.is_compiled(frame, config):
-            self._show_compiling(frame, wanted)
-        shown = self._session.detect(frame, config)
-        tracked, problems = None, []
-        if wanted.view.tracks and self._tracks is not None:
-            if not self._track_up_to(self._tracks, shown, wanted):
+        first = self._find(self._side, wanted)
+        if first is None:
+            return
+        scene, second, other = self._scene(self._side, first, wanted), None, None
+        if self._compared is not None:
+            second = self._find(self._compared, wanted)
+            if second is None:
                 return
-            tracked, problems = self._tracks.find(wanted.index, config)
-        self._page.show_scene(build_scene(frame, shown.detections, wanted.view, tracked))
+            other = self._scene(self._compared, second, wanted)
+        self._page.show_scene(scene, other)
         min_score = wanted.view.min_score
-        answer = words.describe(shown, self._session, index=wanted.index, min_score=min_score)
-        self._page.show_words(
-            answer + ("" if tracked is None else words.describe_tracks(tracked, min_score=min_score)),
-            status=words.describe_status(shown, tracked, problems=problems),
-            points=words.describe_points(shown),
-        )
+        text = words.describe(first.shown, self._session, index=wanted.index, min_score=min_score)
+        text += "" if first.tracked is None else words.describe_tracks(first.tracked, min_score=min_score)
+        status = words.describe_status(first.shown, first.tracked, problems=first.problems)
+        if second is not None and other is not None:
+            is_same = second.shown.frame is first.shown.frame
+            text += words.describe_compared(second.shown, other, scene, is_same_sweep=is_same)
+            status += words.describe_status(
+                second.shown, second.tracked, problems=second.problems, title=other.title
+            )
+        self._page.show_words(text, status=status, points=words.describe_points(first.shown))
 
-    def _track_up_to(self, tracks: TrackMemory, shown: Shown, wanted: Wanted) -> bool:
+    def _find(self, side: Side, wanted: Wanted) -> _Answer | None:
+        """Detects and tracks what is missing; None where another wish came meanwhile."""
+        config = wanted.config if side.config is None else side.config
+        frame = self._frame(side, wanted.index)
+        with contextlib.ExitStack() as stack:
+            if not side.session.is_compiled(frame, config):
+                stack.enter_context(self._compiling(side, frame, wanted))
+            shown = side.session.detect(frame, config)
+        if not wanted.view.tracks or side.tracks is None:
+            return _Answer(shown=shown, tracked=None, problems=[])
+        if not self._track_up_to(side, side.tracks, shown, wanted):
+            return None
+        tracked, problems = side.tracks.find(wanted.index, config)
+        return _Answer(shown=shown, tracked=tracked, problems=problems)
+
+    def _frame(self, side: Side, index: int) -> Frame:
+        session = self._session if side.same_sweeps else side.session
+        if index >= len(session):
+            raise InputError(f"{side.title} has {len(session)} sweeps, and none to compare with this one.")
+        return session.frame(index)
+
+    def _scene(self, side: Side, answer: _Answer, wanted: Wanted) -> Scene:
+        is_second = side is self._compared
+        view, frame = wanted.view, answer.shown.frame
+        title = side.title or (wanted.title if self._compared is not None else "")
+        if is_second and side.same_sweeps and not view.apart_m:
+            # In the same place, points and labels would be drawn twice.
+            view = dataclasses.replace(view, labels=False)
+        scene = build_scene(
+            frame, answer.shown.detections, view, answer.tracked, title=title, compared=is_second
+        )
+        if is_second and side.same_sweeps and not view.apart_m:
+            scene = dataclasses.replace(scene, points=scene.points[:0], colors=scene.colors[:0])
+        return scene
+
+    def _track_up_to(self, side: Side, tracks: TrackMemory, shown: Shown, wanted: Wanted) -> bool:
         """Tracks what is missing up to the sweep; False where another wish came meanwhile."""
         done, total = tracks.progress(wanted.index, shown.config)
         # The first sweep of a drive looks for poses and compiles, and a jump takes many sweeps.
-        told_s = 0.0 if done == 0 or total - done > 1 else time.monotonic()
-        while done < total:
-            if self._is_superseded():
-                return False
-            if time.monotonic() - told_s > TELL_S:
-                self._show_tracking(done, total, shown, wanted)
-                told_s = time.monotonic()
-            tracks.step(wanted.index, shown.config)
-            done, _ = tracks.progress(wanted.index, shown.config)
+        is_long = done == 0 or total - done > 1
+
+        def tell(seconds: float) -> None:
+            text = f"tracking: {done} of {total} sweeps, {seconds:.0f} s; the timeline goes back without it"
+            self._tell(side, text, shown.frame, wanted, points=words.describe_points(shown))
+
+        if done < total and is_long and side is self._side:
+            self._page.show_scene(build_scene(shown.frame, shown.detections, wanted.view))
+        with telling(tell, at_once=is_long) if done < total else contextlib.nullcontext():
+            while done < total:
+                if self._is_superseded():
+                    return False
+                tracks.step(wanted.index, shown.config)
+                done, _ = tracks.progress(wanted.index, shown.config)
         return True
 
     def _is_superseded(self) -> bool:
         return self._stopped or (self._answered is not None and self._wanted is not self._answered)
 
-    def _show_tracking(self, done: int, total: int, shown: Shown, wanted: Wanted) -> None:
-        self._page.show_scene(build_scene(shown.frame, shown.detections, wanted.view))
-        text = f"tracking: {done} of {total} sweeps, once; the timeline goes back without it"
-        count = len(self._session)
-        self._page.show_words(
-            words.describe_work(text, index=wanted.index, count=count, frame=shown.frame),
-            points=words.describe_points(shown),
-        )
+    @contextlib.contextmanager
+    def _compiling(self, side: Side, frame: Frame, wanted: Wanted) -> Iterator[None]:
+        """Says that it compiles, and for how long, until the block ends."""
+        if side is self._side:
+            self._page.show_scene(build_scene(frame, None, wanted.view))
+        what = f"compiling for {frame.cloud.capacity:,} points, once; later runs load it from the cache"
+        with telling(lambda seconds: self._tell(side, f"{what}: {seconds:.0f} s", frame, wanted)):
+            yield
 
-    def _show_compiling(self, frame: Frame, wanted: Wanted) -> None:
-        self._page.show_scene(build_scene(frame, None, wanted.view))
-        text = f"compiling for {frame.cloud.capacity:,} points, once; later runs load it from the cache"
-        words_so_far = words.describe_work(text, index=wanted.index, count=len(self._session), frame=frame)
-        self._page.show_words(words_so_far)
+    def _tell(self, side: Side, text: str, frame: Frame, wanted: Wanted, *, points: str = "") -> None:
+        text = f"{side.title}: {text}" if side is self._compared else text
+        index, count = wanted.index, len(self._session)
+        self._page.show_words(words.describe_work(text, index=index, count=count, frame=frame), points=points)
 
     def _show_error(self, message: str, wanted: Wanted) -> None:
         self._page.show_scene(None)
         text = words.describe_error(message, index=wanted.index, count=len(self._session))
         self._page.show_words(text)
+
+
+@contextlib.contextmanager
+def telling(tell: Callable[[float], None], *, at_once: bool = True) -> Iterator[None]:
+    """Tells again and again, from another thread, for how long a block has been running.
+
+    Args:
+      tell: is called with seconds, every `TELL_S`.
+      at_once: whether it is also called before the block runs.
+
+    Yields:
+      Nothing; `tell` is never called after the block.
+    """
+    start, is_over = time.monotonic(), threading.Event()
+
+    def repeat() -> None:
+        while not is_over.wait(TELL_S):
+            tell(time.monotonic() - start)
+
+    if at_once:
+        tell(0.0)
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        thread.join()

@@ -12,7 +12,9 @@ from jaxbox.config.class_priors import classes_in_words
 from jaxbox.types import Detections, Motion, Status
 from jaxbox.viewer.drives import TrackedFrame
 from jaxbox.viewer.frames import Frame
+from jaxbox.viewer.scene import Scene
 from jaxbox.viewer.session import Session, Shown
+from jaxbox.viz.boxes import find_matches
 from jaxbox.viz.tracks import shown_rows
 
 _COUNTS = (
@@ -28,7 +30,11 @@ _COUNTS = (
 )
 _STYLE = "padding: 0.3em 0.75em; font-size: 0.9em; line-height: 1.45; overflow-wrap: anywhere;"
 _JPEG_QUALITY = 85
-_QUIET, _WARNING, _ERROR = "#8a93a0", "#ffbe28", "#ff6b6b"
+# Each on a light page, and on a dark one.
+_QUIET, _WARNING, _ERROR = (
+    f"light-dark({light}, {dark})"
+    for light, dark in (("#5b6470", "#98a1ad"), ("#8a5200", "#ffbe28"), ("#c22727", "#ff7b7b"))
+)
 
 
 def describe(shown: Shown, session: Session, *, index: int, min_score: float) -> str:
@@ -64,6 +70,34 @@ def describe(shown: Shown, session: Session, *, index: int, min_score: float) ->
     )
 
 
+def describe_compared(shown: Shown, scene: Scene, first: Scene, *, is_same_sweep: bool) -> str:
+    """What is compared: its vehicles and time; of the same sweep, how many boxes both have.
+
+    Args:
+      shown: the answer that is compared.
+      scene: of it.
+      first: the scene that it is compared with.
+      is_same_sweep: whether both are of one sweep.
+
+    Returns:
+      HTML.
+    """
+    noun = "vehicle" if scene.num_boxes == 1 else "vehicles"
+    name = "" if is_same_sweep else _quiet(html.escape(shown.frame.name))
+    lines = [
+        f"compared: <b>{html.escape(scene.title)}</b> {name}",
+        f"<b><span data-jaxbox='compared-vehicles'>{scene.num_boxes}</span> {noun}</b>, "
+        f"{shown.detect_s * 1e3:.1f} ms to detect",
+    ]
+    if is_same_sweep:
+        both = int(find_matches(first.boxes, scene.boxes)[0].sum())
+        lines.append(
+            f"<span data-jaxbox='both'>{both}</span> in both, {first.num_boxes - both} only in "
+            f"{html.escape(first.title)}, {scene.num_boxes - both} only in {html.escape(scene.title)}"
+        )
+    return _block(lines, name="compared")
+
+
 def describe_tracks(tracked: TrackedFrame, *, min_score: float) -> str:
     """How many vehicles are followed, and what they do.
 
@@ -88,7 +122,7 @@ def describe_tracks(tracked: TrackedFrame, *, min_score: float) -> str:
 
 
 def describe_status(
-    shown: Shown, tracked: TrackedFrame | None = None, *, problems: Sequence[str] = ()
+    shown: Shown, tracked: TrackedFrame | None = None, *, problems: Sequence[str] = (), title: str = ""
 ) -> str:
     """What was dropped, and what could not be read besides the points.
 
@@ -96,15 +130,17 @@ def describe_status(
       shown: what is on the page.
       tracked: its tracks, where they are wanted.
       problems: of the tracking, in words.
+      title: of what is compared; empty for the page's own.
 
     Returns:
       HTML: a sentence each, or one that says that there is nothing.
     """
     sentences = [*Status(int(shown.detections.status)).describe(), *shown.frame.problems]
     sentences += [*([] if tracked is None else tracked.status.describe()), *problems]
+    start = f"{title}: " if title else ""
     if not sentences:
-        return _block([_quiet("nothing was dropped")], name="status")
-    return _block([_colored(html.escape(text), _WARNING) for text in sentences], name="status")
+        return _block([_quiet(html.escape(f"{start}nothing was dropped"))], name="status")
+    return _block([_colored(html.escape(start + text), _WARNING) for text in sentences], name="status")
 
 
 def describe_points(shown: Shown) -> str:
