@@ -36,8 +36,9 @@ from jaxbox.io.registry import POINT_FORMATS, POINT_SUFFIXES, format_of, suffix_
 from jaxbox.io.rosbag import ROSBAG
 from jaxbox.io.sweep import Sweep
 from jaxbox.io.text_points import TEXT
+from jaxbox.io.velodyne import CAPTURE
 
-RECORDING_FORMATS: tuple[RecordingFormat, ...] = (MCAP, ROSBAG)
+RECORDING_FORMATS: tuple[RecordingFormat, ...] = (MCAP, ROSBAG, CAPTURE)
 """The recordings that `open_sweeps` knows; a folder of ROS 2 whose storage is MCAP is read as MCAP."""
 
 RECORDING_SUFFIXES: tuple[str, ...] = tuple(
@@ -67,9 +68,9 @@ def open_sweeps(path: PathLike | Sequence[PathLike], *, topic: str | None = None
     recording holds one message at a time.
 
     Args:
-      path: a point file, a recording (ROS bag, MCAP), a folder of either, a KITTI, Argoverse 2 or nuScenes
-        folder, a pattern such as ``"drive/*.pcd"``, or several of them.
-      topic: of the points in recordings; None where each has only one.
+      path: a point file, a recording (ROS bag, MCAP, a capture of packets), a folder of either, a KITTI,
+        Argoverse 2 or nuScenes folder, a pattern such as ``"drive/*.pcd"``, or several of them.
+      topic: of the points in recordings, in captures sender and port; None where each has only one.
 
     Returns:
       At least one sweep, files sorted by path, and recordings by time; their names differ.
