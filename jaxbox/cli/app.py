@@ -115,8 +115,8 @@ def detect(
         list[str],
         typer.Argument(
             help="Sweeps (.bin .pcd.bin .pcd .ply .las .laz .npy .npz .feather .txt .csv .xyz), recordings "
-            "(.bag .db3 .mcap .pcap .pcapng, ROS 2 folders), folders of them, data sets' folders, or patterns "
-            "in quotes; docs/formats.md.",
+            "(.bag .db3 .mcap .pcap .pcapng .osf, ROS 2 folders), folders of them, data sets' folders, or "
+            "patterns in quotes; docs/formats.md.",
         ),
     ],
     *,

@@ -30,6 +30,7 @@ from jaxbox._files import InputError, check_file, read_text
 from jaxbox.io.kitti import tracking_name
 from jaxbox.io.kitti_calibration import RAW_CALIBRATION_FILES
 from jaxbox.io.mcap import MCAP
+from jaxbox.io.ouster import OSF
 from jaxbox.io.points import PointFormat
 from jaxbox.io.recordings import RecordedSweeps, RecordingFormat
 from jaxbox.io.registry import POINT_FORMATS, POINT_SUFFIXES, format_of, suffix_of
@@ -38,7 +39,7 @@ from jaxbox.io.sweep import Sweep
 from jaxbox.io.text_points import TEXT
 from jaxbox.io.velodyne import CAPTURE
 
-RECORDING_FORMATS: tuple[RecordingFormat, ...] = (MCAP, ROSBAG, CAPTURE)
+RECORDING_FORMATS: tuple[RecordingFormat, ...] = (MCAP, ROSBAG, CAPTURE, OSF)
 """The recordings that `open_sweeps` knows; a folder of ROS 2 whose storage is MCAP is read as MCAP."""
 
 RECORDING_SUFFIXES: tuple[str, ...] = tuple(

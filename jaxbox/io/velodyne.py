@@ -19,6 +19,7 @@ from xml.etree import ElementTree
 from jaxbox._extras import require
 from jaxbox._files import InputError, read_text, reason
 from jaxbox.io.captures import Datagram, read_datagrams
+from jaxbox.io.ouster import open_ouster, ouster_metadata
 from jaxbox.io.point_times import timed_points
 from jaxbox.io.points import Points, TimedPoints
 from jaxbox.io.recordings import Message, RecordedSweeps, RecordingFormat, choose_topic
@@ -352,9 +353,29 @@ def _what_is_there(num_velodyne: int, others: collections.Counter[tuple[str, int
     )
 
 
+def open_capture(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
+    """Opens a capture: an Ouster's where its metadata lies beside it, and a Velodyne's otherwise.
+
+    Args:
+      path: the capture.
+      topic: as `open_velodyne_capture` or `jaxbox.io.ouster.open_ouster`.
+
+    Returns:
+      The sweeps.
+
+    Raises:
+      InputError: as either.
+      ImportError: without the extra ``velodyne`` or ``ouster``.
+    """
+    metadata = ouster_metadata(path)
+    if metadata is not None:
+        return open_ouster(path, topic, metadata=metadata)
+    return open_velodyne_capture(path, topic)
+
+
 CAPTURE = RecordingFormat(
     name="captures of packets",
     suffixes=(".pcap", ".pcapng"),
-    open=open_velodyne_capture,
+    open=open_capture,
     read_poses=lambda _: iter(()),
 )
