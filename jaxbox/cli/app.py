@@ -17,14 +17,18 @@ from jaxbox.cli.info import print_info
 from jaxbox.cli.options import (
     EXIT_CODES,
     AddressOption,
+    AxesOption,
     CapacityOption,
+    ColumnsOption,
     DrivesOption,
     Engine,
     EngineOption,
+    FlipOption,
     JsonOption,
     LevelOption,
     PresetOption,
     QuietOption,
+    ScaleOption,
     SensorAtOption,
     SensorOption,
     SetOption,
@@ -41,7 +45,7 @@ from jaxbox.cli.view import ViewOptions, run_view
 from jaxbox.cluster.dataset import SWEEPS_PER_PARTITION
 from jaxbox.evaluation.copies import COPIES
 from jaxbox.evaluation.objectives import OBJECTIVES
-from jaxbox.io import InputError
+from jaxbox.io import ORDINARY, InputError, PointConvention, open_sweeps
 from jaxbox.run.cache import enable_cache
 
 DETECT_EXAMPLES = """Examples:
@@ -137,6 +141,10 @@ def detect(
     topic: TopicOption = None,
     sensor_at: SensorAtOption = None,
     level: LevelOption = False,
+    scale: ScaleOption = 1.0,
+    axes: AxesOption = "ros",
+    flip: FlipOption = "",
+    columns: ColumnsOption = None,
     capacity: CapacityOption = None,
     min_score: Annotated[
         float,
@@ -191,6 +199,7 @@ def detect(
     """
     with input_errors():
         config = chosen_config(preset, settings, changes or [], sensor=sensor)
+        convention = PointConvention(scale, axes, flip, columns)
         if engine is Engine.RAY:
             ray_options = DetectRayOptions(
                 output=output,
@@ -198,7 +207,7 @@ def detect(
                 formats=frozenset(result_format or []),
                 pictures=bool(pictures),
                 points=points,
-                mounted=level or sensor_at is not None,
+                mounted=level or sensor_at is not None or convention != ORDINARY,
                 address=address,
                 jobs=jobs,
                 sweeps_per_partition=sweeps_per_partition or SWEEPS_PER_PARTITION,
@@ -222,6 +231,7 @@ def detect(
             topic=topic,
             sensor_at=sensor_at,
             level=level,
+            convention=convention,
             capacity=capacity,
             min_score=min_score,
             points=True if points is None else points,
@@ -263,6 +273,10 @@ def tune(
     sensor: SensorOption = None,
     settings: SettingsOption = None,
     changes: SetOption = None,
+    scale: ScaleOption = 1.0,
+    axes: AxesOption = "ros",
+    flip: FlipOption = "",
+    columns: ColumnsOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Another number tries other settings.")] = 0,
 ) -> None:
     """Search settings on labelled sweeps, and evaluate them on held-out drives.
@@ -285,6 +299,7 @@ def tune(
             copies=copies,
             objective=objective,
             drives=drives,
+            convention=PointConvention(scale, axes, flip, columns),
             seed=seed,
         )
         raise typer.Exit(run_tune(labels, options, stdout()))
@@ -321,6 +336,10 @@ def info(
     ] = None,
     *,
     topic: TopicOption = None,
+    scale: ScaleOption = 1.0,
+    axes: AxesOption = "ros",
+    flip: FlipOption = "",
+    columns: ColumnsOption = None,
     num_sweeps: Annotated[
         int, typer.Option("--sweeps", min=1, help="Sweeps to look at, spread over all there are.")
     ] = 1,
@@ -333,7 +352,8 @@ def info(
     """
     with input_errors():
         if paths:
-            print_sweep_info(paths, topic=topic, num_sweeps=num_sweeps, as_json=json, console=stdout())
+            sweeps = open_sweeps(paths, topic=topic, convention=PointConvention(scale, axes, flip, columns))
+            print_sweep_info(sweeps, num_sweeps=num_sweeps, as_json=json, console=stdout())
         else:
             print_info(stdout(), as_json=json)
 
@@ -357,6 +377,10 @@ def view(
     topic: TopicOption = None,
     sensor_at: SensorAtOption = None,
     level: LevelOption = False,
+    scale: ScaleOption = 1.0,
+    axes: AxesOption = "ros",
+    flip: FlipOption = "",
+    columns: ColumnsOption = None,
     capacity: CapacityOption = None,
     min_score: Annotated[
         float,
@@ -376,6 +400,7 @@ def view(
             topic=topic,
             sensor_at=sensor_at,
             level=level,
+            convention=PointConvention(scale, axes, flip, columns),
             capacity=capacity,
             min_score=min_score,
             track=track,

@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, overload
 
 from jaxbox._files import InputError
+from jaxbox.io.convention import ORDINARY
 from jaxbox.io.points import RecordedPoints
 from jaxbox.io.sweep import Sweep
 
@@ -66,6 +67,8 @@ class RecordedSweeps(Sequence[Sweep]):
         """The recording."""
         self.topic = topic
         """The topic that the sweeps are from."""
+        self.convention = ORDINARY
+        """How the points of each are to be taken."""
         self._count = count
         self._messages = messages
 
@@ -77,7 +80,14 @@ class RecordedSweeps(Sequence[Sweep]):
         """One pass over the recording."""
         for index, (timestamp_ns, decode) in enumerate(self._messages()):
             name = f"{self.path.stem}_{index:06d}"
-            yield Sweep(name, self.path, timestamp_ns=timestamp_ns, sequence=self.path.stem, decode=decode)
+            yield Sweep(
+                name,
+                self.path,
+                timestamp_ns=timestamp_ns,
+                sequence=self.path.stem,
+                decode=decode,
+                convention=self.convention,
+            )
 
     @overload
     def __getitem__(self, index: int) -> Sweep: ...
