@@ -14,7 +14,7 @@ import jaxbox
 PROJECT = pathlib.Path(__file__).parents[1]
 HEAVY = {
     "IPython", "cv2", "laspy", "matplotlib", "mcap", "open3d", "pandas", "polars", "pyarrow", "pypcd4",
-    "ray", "rerun", "rich", "rosbags", "scipy", "typer", "viser",
+    "ray", "rerun", "rich", "rosbags", "scipy", "typer", "velodyne_decoder", "viser",
 }  # fmt: skip
 """Optional, or of one part only: imported where they are used."""
 MAX_IMPORT_S = 1.0
