@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import time
+import webbrowser
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -14,11 +15,14 @@ from jaxbox._interrupts import heard, stoppable
 from jaxbox.cli.console import ExitCode, exit_code, printable, stderr, stdout
 from jaxbox.cli.inputs import print_json
 from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
+from jaxbox.cli.report import SHOWN_MIN_SCORE
+from jaxbox.cli.view import initial_wish
 from jaxbox.geometry.mounting import Mounting
 from jaxbox.io.results import SweepResult
 from jaxbox.live import Latencies, LiveConfig, LiveResult, LiveRun, RecordedSource, Source
 from jaxbox.live.foxglove import open_foxglove
 from jaxbox.live.mounted import MountedSource
+from jaxbox.live.page import open_page
 from jaxbox.live.records import LiveRecords
 from jaxbox.live.sinks import Sink
 from jaxbox.live.sources import is_sensor, open_sensor
@@ -57,6 +61,10 @@ class LiveOptions:
     """Address that servers listen at."""
     foxglove_port: int | None
     """Port of the server for Foxglove; None for no server."""
+    page_port: int | None
+    """Port of the viewer's page; None for no page."""
+    open_browser: bool
+    """Whether the browser is opened at the page."""
     points: bool
     """Whether the points are served, too."""
     quiet: bool
@@ -141,7 +149,7 @@ def run_live(source: str, options: LiveOptions) -> ExitCode:
     records = LiveRecords(source, min_score=options.min_score, confirmed=options.confirmed)
     interrupted = False
     with contextlib.ExitStack() as stack:
-        sinks = list(_open_sinks(stack, options))
+        sinks = list(_open_sinks(stack, run, options))
         show = stack.enter_context(_status_line(shown=not options.quiet))
         results = stack.enter_context(contextlib.closing(iter(run)))
         try:
@@ -185,7 +193,7 @@ def _open(source: str, options: LiveOptions) -> Source:
     return RecordedSource(sweeps, name=source, rate_hz=options.rate_hz, loop=options.loop)
 
 
-def _open_sinks(stack: contextlib.ExitStack, options: LiveOptions) -> Iterator[Sink]:
+def _open_sinks(stack: contextlib.ExitStack, run: LiveRun, options: LiveOptions) -> Iterator[Sink]:
     if options.json:
         yield lambda _, written: print_json(written.record)
     if options.foxglove_port is not None:
@@ -195,6 +203,20 @@ def _open_sinks(stack: contextlib.ExitStack, options: LiveOptions) -> Iterator[S
         if not options.quiet:
             _tell(f"Foxglove: open a connection to {url}")
         yield sink
+    if options.page_port is not None:
+        yield _open_page(stack, run, options, options.page_port)
+
+
+def _open_page(stack: contextlib.ExitStack, run: LiveRun, options: LiveOptions, port: int) -> Sink:
+    is_tracked = options.config.tracker is not None
+    min_score = max(options.min_score, SHOWN_MIN_SCORE)
+    wanted = initial_wish(options.config.detector, min_score=min_score, track=is_tracked)
+    sink, url = stack.enter_context(open_page(wanted, run.use, host=options.host, port=port))
+    if not options.quiet:
+        _tell(f"the page: {url}")
+    if options.open_browser:
+        webbrowser.open(url)
+    return sink
 
 
 @contextlib.contextmanager

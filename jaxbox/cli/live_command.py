@@ -21,10 +21,13 @@ from jaxbox.io import InputError
 from jaxbox.live import LiveConfig
 from jaxbox.live.foxglove import PORT as FOXGLOVE_PORT
 from jaxbox.live.loop import TIMEOUT_S
+from jaxbox.live.page import PORT as PAGE_PORT
 from jaxbox.run.pose_providers import ESTIMATED
 from jaxbox.run.tracking import MAX_TRACKS, RATE_HZ
 
 LIVE_EXAMPLES = """Examples:
+
+jaxbox live drive.mcap --open
 
 jaxbox live drive.mcap --foxglove
 
@@ -53,6 +56,15 @@ def live(
     foxglove_port: Annotated[
         int, typer.Option(min=0, max=65535, help="Port of that server; 0 takes a free one.")
     ] = FOXGLOVE_PORT,
+    view: Annotated[
+        bool, typer.Option("--view", help="Serve the viewer's page: boxes, trails, thresholds (extra view).")
+    ] = False,
+    view_port: Annotated[
+        int, typer.Option(min=0, max=65535, help="Port of that page; 0 takes a free one.")
+    ] = PAGE_PORT,
+    open_browser: Annotated[
+        bool, typer.Option("--open", help="Serve that page, and open the browser at it.")
+    ] = False,
     host: Annotated[
         str,
         typer.Option(help="Address that servers listen at. The default is reached from this machine only."),
@@ -137,6 +149,8 @@ def live(
             confirmed=confirmed,
             host=host,
             foxglove_port=foxglove_port if foxglove else None,
+            page_port=view_port if view or open_browser else None,
+            open_browser=open_browser,
             points=points,
             quiet=quiet,
             json=json,

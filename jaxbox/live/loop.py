@@ -6,6 +6,7 @@ import time
 from collections.abc import Generator
 
 from jaxbox._padding import fitting_capacity
+from jaxbox.config import DetectorConfig
 from jaxbox.live.pipeline import LiveConfig, Pipeline
 from jaxbox.live.reception import Reception, Report
 from jaxbox.live.sweep import LiveSweep, Source
@@ -77,6 +78,15 @@ class LiveRun:
         """What came so far and was no sweep, such as a broken file or packet."""
         return self._reception.num_faults
 
+    def use(self, detector: DetectorConfig) -> None:
+        """Detects with other settings from the next sweep on; any thread may ask.
+
+        Args:
+          detector: the settings. Where they differ in more than thresholds, the next sweep takes as long as
+            it takes to compile.
+        """
+        self._config = dataclasses.replace(self._config, detector=detector)
+
     def __iter__(self) -> Generator[LiveResult, None, None]:
         """The results as long as the source goes on; once.
 
@@ -101,6 +111,7 @@ class LiveRun:
                     sweep = sweep.arriving_now()
                 reception.go_on()
                 self._check_size(sweep, pipeline.capacity)
+                pipeline.detector = self._config.detector
                 found = pipeline(sweep)
                 yield LiveResult(
                     sweep=sweep,

@@ -48,6 +48,8 @@ class Pipeline:
         """
         self.capacity = capacity
         """Points that every sweep is padded to; of larger ones the farthest points are left out."""
+        self.detector = config.detector
+        """The detector's settings; others, of the same structure, take effect without compiling."""
         self._config = config
         self._follower = self._begin()
         # An empty sweep has a program of the same shape; what it leaves behind is forgotten.
@@ -78,7 +80,7 @@ class Pipeline:
     def _detect(self, sweep: LiveSweep | ReadSweep) -> Detections:
         xyz, intensity = sweep.read_points()
         cloud = PointCloud.from_numpy(xyz, intensity, capacity=self.capacity)
-        return detect(cloud, self._config.detector).on_host()
+        return detect(cloud, self.detector).on_host()
 
 
 class _Follower:
