@@ -24,6 +24,7 @@ from jaxbox.live.foxglove import open_foxglove
 from jaxbox.live.mounted import MountedSource
 from jaxbox.live.page import open_page
 from jaxbox.live.records import LiveRecords
+from jaxbox.live.ros2 import open_ros2
 from jaxbox.live.sinks import Sink
 from jaxbox.live.sources import is_sensor, open_sensor
 
@@ -67,6 +68,8 @@ class LiveOptions:
     """Whether the browser is opened at the page."""
     points: bool
     """Whether the points are served, too."""
+    ros2: bool
+    """Whether boxes are published in ROS 2."""
     quiet: bool
     """Whether only errors are printed."""
     json: bool
@@ -203,6 +206,8 @@ def _open_sinks(stack: contextlib.ExitStack, run: LiveRun, options: LiveOptions)
         if not options.quiet:
             _tell(f"Foxglove: open a connection to {url}")
         yield sink
+    if options.ros2:
+        yield stack.enter_context(open_ros2())
     if options.page_port is not None:
         yield _open_page(stack, run, options, options.page_port)
 

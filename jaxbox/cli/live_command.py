@@ -46,7 +46,7 @@ def live(
         str,
         typer.Argument(
             help="A recording, folder or pattern as `detect` takes it, at its own pace; udp://HOST:PORT for "
-            "the packets of a Velodyne sensor; docs/live.md."
+            "the packets of a Velodyne sensor; ouster://HOST; ros2://TOPIC; docs/live.md."
         ),
     ],
     *,
@@ -70,6 +70,9 @@ def live(
         typer.Option(help="Address that servers listen at. The default is reached from this machine only."),
     ] = "127.0.0.1",
     points: Annotated[bool, typer.Option("--points/--no-points", help="Serve the points, too.")] = True,
+    ros2: Annotated[
+        bool, typer.Option("--ros2", help="Publish /jaxbox/detections and /jaxbox/markers in ROS 2.")
+    ] = False,
     json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object a sweep, and a summary, as they come.")
     ] = False,
@@ -152,6 +155,7 @@ def live(
             page_port=view_port if view or open_browser else None,
             open_browser=open_browser,
             points=points,
+            ros2=ros2,
             quiet=quiet,
             json=json,
         )

@@ -6,7 +6,9 @@ from collections.abc import Callable, Mapping
 
 from jaxbox import io
 from jaxbox.io import InputError
+from jaxbox.live.ouster import OusterSource
 from jaxbox.live.recorded import RecordedSource
+from jaxbox.live.ros2 import Ros2Source
 from jaxbox.live.sweep import Source
 from jaxbox.live.velodyne import PORT, UdpAddress, VelodyneSource
 from jaxbox.run.tracking import RATE_HZ
@@ -28,7 +30,8 @@ def open_source(
 
     Args:
       source: a path as `jaxbox.io.open_sweeps` takes it; ``udp://[HOST][:PORT]`` for packets of a Velodyne
-        sensor, with ``?from=``, ``model=`` and ``calibration=`` as `UdpAddress` has them.
+        sensor, with ``?from=``, ``model=`` and ``calibration=`` as `UdpAddress` has them; ``ouster://HOST``;
+        ``ros2://TOPIC``.
       topic: of the points in recordings.
       rate_hz: sweeps a second of recordings without times.
       loop: whether a recording begins again where it ends.
@@ -103,6 +106,8 @@ def parse_udp(source: str) -> UdpAddress:
 
 
 SENSORS: Mapping[str, Callable[[str], Source]] = {
+    "ouster": lambda source: OusterSource(source.partition("://")[2].strip("/")),
+    "ros2": lambda source: Ros2Source("/" + source.partition("://")[2].lstrip("/")),
     "udp": lambda source: VelodyneSource(parse_udp(source)),
 }
 """What opens an address, by what stands before ``://``."""

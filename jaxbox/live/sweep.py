@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
+from jaxbox.io.mcap_results import FRAME_ID
 from jaxbox.io.points import TimedPoints
 
 
@@ -24,6 +25,8 @@ class LiveSweep:
     """When its last point was there, ns since 1970 by this machine's clock."""
     points: TimedPoints
     """The points, and when each was measured."""
+    frame_id: str = FRAME_ID
+    """Name of the coordinate frame of the points."""
 
     @property
     def num_points(self) -> int:
@@ -40,7 +43,12 @@ class LiveSweep:
 
     def arriving_now(self) -> "LiveSweep":
         """The same sweep, as if it came in now."""
-        return dataclasses.replace(self, arrived_ns=time.time_ns())
+        return dataclasses.replace(self, arrived_ns=now_ns())
+
+
+def now_ns() -> int:
+    """The time by this machine's clock, ns since 1970."""
+    return time.time_ns()
 
 
 @dataclasses.dataclass(frozen=True)

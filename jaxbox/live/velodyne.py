@@ -12,7 +12,6 @@ import pathlib
 import socket
 import struct
 import sys
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,7 +20,7 @@ import numpy as np
 from jaxbox._extras import require
 from jaxbox._files import read_text, reason
 from jaxbox.io import InputError, TimedPoints
-from jaxbox.live.sweep import IDLE_S, Fault, LiveSweep
+from jaxbox.live.sweep import IDLE_S, Fault, LiveSweep, now_ns
 
 PORT = 2368
 """To which Velodyne sensors send unless they are told otherwise."""
@@ -170,7 +169,11 @@ def _listening(address: UdpAddress) -> socket.socket:
     try:
         family, kind, *_, place = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM)[0]
         found = socket.socket(family, kind)
-        found.bind(place)
+        try:
+            found.bind(place)
+        except BaseException:
+            found.close()
+            raise
     except (OSError, OverflowError) as error:
         raise InputError(
             f"cannot listen at {address.host}, UDP port {address.port} ({error}); does another program, "
@@ -198,7 +201,7 @@ def _receive(listening: socket.socket) -> tuple[bytes, int, str] | None:
         packet, extras, _, sender = listening.recvmsg(2 * PACKET_BYTES, socket.CMSG_SPACE(_STAMP.size))
     except TimeoutError:
         return None
-    stamp_ns = time.time_ns()
+    stamp_ns = now_ns()
     for _, kind, data in extras:
         if kind == _SO_TIMESTAMPNS and len(data) == _STAMP.size:
             seconds, nanoseconds = _STAMP.unpack(data)
