@@ -109,8 +109,8 @@ class LiveProcess:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Ends it as Ctrl-C does."""
-        self._process.send_signal(2)
+        """Ends it, as Ctrl-C does, which is not heard where this program is in the background."""
+        self._process.terminate()
         self._process.wait()
         self._reader.join()
 

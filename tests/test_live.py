@@ -5,6 +5,7 @@ import functools
 import itertools
 import json
 import socket
+import sys
 import threading
 import time
 import types
@@ -438,6 +439,24 @@ def test_a_turn_that_does_not_end_is_dropped(monkeypatch):
         listening.send([turns()[0][0]] * 60)
         listening.wait(lambda: listening.faults)
     assert "50 packets, and the sensor has not turned round" in listening.faults[0]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts what is lost")
+def test_packets_that_nobody_fetched_in_time_are_counted(monkeypatch):
+    monkeypatch.setattr(velodyne, "_BUFFER_BYTES", 20_000)
+    monkeypatch.setattr(velodyne, "IDLE_S", 0.01)
+    source = VelodyneSource(UdpAddress(port=0))
+    items = iter(source)
+    assert next(items) is None
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as outgoing:
+        for packet in [*turns()[0], *turns()[1]]:
+            outgoing.sendto(packet, ("127.0.0.1", source.port))
+        # What the buffer held, and then a silence.
+        assert not any(itertools.islice(items, 100))
+        outgoing.sendto(turns()[2][0], ("127.0.0.1", source.port))
+    fault = next(items)
+    assert "packets were lost" in fault.reason
+    items.close()
 
 
 def test_a_port_that_is_taken_and_unknown_models_are_said_at_once(tmp_path):

@@ -32,8 +32,9 @@ _BUFFER_BYTES = 2**22
 """Of the socket: a second of the busiest sensor."""
 _STAMP = struct.Struct("@ll")
 """Seconds and nanoseconds, by which the kernel says when a packet came: not late, where this program is."""
-_SO_TIMESTAMPNS = getattr(socket, "SO_TIMESTAMPNS", 35)
-"""Linux's number of it, which Python 3.11 does not name."""
+_LOST = struct.Struct("@I")
+_SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
+"""Linux's numbers, which Python does not name: packets come with their time, and with how many were lost."""
 _TIME_COLUMN = 4
 _NS_PER_S = 10**9
 
@@ -81,7 +82,7 @@ class VelodyneSource:
 
     def __iter__(self) -> Iterator[LiveSweep | Fault | None]:
         """A sweep with the packet that ends its turn, and None with the others."""
-        sender, frame = self._address.sender, 0
+        sender, frame, num_lost = self._address.sender, 0, None
         with self._socket:
             _drain(self._socket)
             while True:
@@ -92,7 +93,12 @@ class VelodyneSource:
                     sender = self._address.sender
                     yield None
                     continue
-                packet, stamp_ns, host = received
+                packet, stamp_ns, host, lost = received
+                if num_lost is not None and lost > num_lost:
+                    yield Fault(
+                        f"{self.name}: {lost - num_lost} packets were lost; this machine is too busy."
+                    )
+                num_lost = lost
                 if sender not in (None, host):
                     yield Fault(f"{self.name}: a packet from {host}, while {sender} is listened to.")
                     continue
@@ -183,6 +189,7 @@ def _listening(address: UdpAddress) -> socket.socket:
     found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
     if sys.platform == "linux":
         found.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        found.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
     return found
 
 
@@ -195,15 +202,21 @@ def _drain(listening: socket.socket) -> None:
     listening.settimeout(IDLE_S)
 
 
-def _receive(listening: socket.socket) -> tuple[bytes, int, str] | None:
-    """A datagram, when it was there, ns since 1970, and from which address; None where none came."""
+def _receive(listening: socket.socket) -> tuple[bytes, int, str, int] | None:
+    """A datagram, when it was there, ns since 1970, from which address, and how many were lost so far.
+
+    None where none came. Only Linux counts what is lost, where nobody fetches packets in time.
+    """
+    room = socket.CMSG_SPACE(_STAMP.size) + socket.CMSG_SPACE(_LOST.size)
     try:
-        packet, extras, _, sender = listening.recvmsg(2 * PACKET_BYTES, socket.CMSG_SPACE(_STAMP.size))
+        packet, extras, _, sender = listening.recvmsg(2 * PACKET_BYTES, room)
     except TimeoutError:
         return None
-    stamp_ns = now_ns()
+    stamp_ns, num_lost = now_ns(), 0
     for _, kind, data in extras:
         if kind == _SO_TIMESTAMPNS and len(data) == _STAMP.size:
             seconds, nanoseconds = _STAMP.unpack(data)
             stamp_ns = seconds * _NS_PER_S + nanoseconds
-    return packet, stamp_ns, sender[0]
+        elif kind == _SO_RXQ_OVFL:
+            (num_lost,) = _LOST.unpack(data)
+    return packet, stamp_ns, sender[0], num_lost
