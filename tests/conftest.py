@@ -23,6 +23,7 @@ FAST = {
     "test_evaluation_tracking.py", "test_fuzz_readers.py", "test_geometry.py", "test_hostile_files.py",
     "test_io_drives.py", "test_io_files.py", "test_io_formats.py", "test_io_kitti.py",
     "test_io_kitti_tracking.py", "test_io_other_sensors.py", "test_io_poses.py", "test_lidar_packets.py",
+    "test_live.py", "test_live_libraries.py",
     "test_packaging.py", "test_paper_table.py", "test_point_times.py", "test_reference.py",
     "test_reliability_benchmarks.py", "test_sensors_benchmark.py", "test_speed_benchmarks.py",
     "test_synthetic.py",
