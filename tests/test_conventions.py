@@ -29,7 +29,7 @@ LAYERS = [
     {"tracking"},
     {"run"},
     {"io", "evaluation", "viz", "synthetic"},
-    {"tuning", "viewer", "cluster"},
+    {"tuning", "viewer", "cluster", "live"},
 ]
 # An oracle is independent of what it checks.
 REFERENCE = {"_version", "config", "types"}
@@ -45,6 +45,7 @@ PUBLIC_MODULES = [
     "jaxbox",
     "jaxbox.cluster",
     "jaxbox.io",
+    "jaxbox.live",
     "jaxbox.evaluation",
     "jaxbox.evaluation.tracking",
     "jaxbox.run.export",

@@ -13,8 +13,8 @@ import jaxbox
 
 PROJECT = pathlib.Path(__file__).parents[1]
 HEAVY = {
-    "IPython", "cv2", "laspy", "matplotlib", "mcap", "open3d", "pandas", "polars", "pyarrow", "pypcd4",
-    "ray", "rerun", "rich", "rosbags", "scipy", "typer", "velodyne_decoder", "viser",
+    "IPython", "cv2", "foxglove", "laspy", "matplotlib", "mcap", "open3d", "ouster", "pandas", "polars",
+    "pyarrow", "pypcd4", "ray", "rerun", "rich", "rosbags", "scipy", "typer", "velodyne_decoder", "viser",
 }  # fmt: skip
 """Optional, or of one part only: imported where they are used."""
 MAX_IMPORT_S = 1.0

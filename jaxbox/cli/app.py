@@ -1,4 +1,4 @@
-"""The eight commands and their options; the work is done in the module of each."""
+"""The commands and their options; the work is done in the module of each."""
 
 import pathlib
 from typing import Annotated
@@ -15,6 +15,7 @@ from jaxbox.cli.detect_ray import DetectRayOptions, run_detect_ray
 from jaxbox.cli.eval_command import evaluate
 from jaxbox.cli.export import Platform, run_export
 from jaxbox.cli.info import print_info
+from jaxbox.cli.live_command import LIVE_EXAMPLES, live
 from jaxbox.cli.options import (
     EXIT_CODES,
     AddressOption,
@@ -259,6 +260,7 @@ def detect(
 
 
 app.command(epilog=TRACK_EXAMPLES + EXIT_CODES)(track)
+app.command(epilog=LIVE_EXAMPLES + EXIT_CODES)(live)
 app.command("eval", epilog=EXIT_CODES)(evaluate)
 
 

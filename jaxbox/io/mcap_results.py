@@ -9,7 +9,7 @@ import contextlib
 import json
 import pathlib
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -37,6 +37,15 @@ WORLD_ID = "world"
 _TITLES = {RECORDS_TOPIC: "jaxbox.Detections", TRACKS_TOPIC: "jaxbox.Tracks"}
 
 
+def record_schema(topic: str) -> dict[str, str]:
+    """The JSON schema of a topic of records.
+
+    >>> record_schema(RECORDS_TOPIC)
+    {'title': 'jaxbox.Detections', 'type': 'object'}
+    """
+    return {"title": _TITLES[topic], "type": "object"}
+
+
 @contextlib.contextmanager
 def open_mcap_results(path: pathlib.Path, resume: bool = False) -> Iterator[WriteResult]:
     """Opens an MCAP file for the results of a run; see the module for its topics.
@@ -62,22 +71,45 @@ def open_mcap_results(path: pathlib.Path, resume: bool = False) -> Iterator[Writ
 
         def write(result: SweepResult) -> None:
             nonlocal index
-            time_ns = result.time_ns(index)
-            common = {"timestamp_ns": time_ns, "frame_id": FRAME_ID}
-            if result.xyz is not None:
-                intensity = np.zeros(len(result.xyz)) if result.intensity is None else result.intensity
-                channels.add_message(POINTS_TOPIC, point_cloud(result.xyz, intensity, **common), time_ns)
-            if result.trails is not None:
-                pose = np.array(result.record["T_world_sensor"])
-                channels.add_message(POSE_TOPIC, _transform(pose, time_ns), time_ns)
-            scene = scene_update(result.record, trails=result.trails, **common)
-            channels.add_message(BOXES_TOPIC, scene, time_ns)
-            topic = RECORDS_TOPIC if result.trails is None else TRACKS_TOPIC
-            channels.add_record(topic, result.record, time_ns)
+            add_result(channels, result, result.time_ns(index))
             index += 1
 
         yield write
         writer.finish()
+
+
+class ResultChannels(Protocol):
+    """What takes messages by topic: a file, or a server."""
+
+    def add_message(self, topic: str, message: Any, time_ns: int) -> None:
+        """Adds a protobuf message."""
+        ...
+
+    def add_record(self, topic: str, record: Any, time_ns: int) -> None:
+        """Adds a record as JSON."""
+        ...
+
+
+def add_result(channels: ResultChannels, result: SweepResult, time_ns: int) -> None:
+    """Adds the messages of one sweep; see the module for the topics.
+
+    Args:
+      channels: what takes them.
+      result: of the sweep.
+      time_ns: of the sweep, ns since 1970.
+
+    Raises:
+      ImportError: without the extra ``mcap``.
+    """
+    common = {"timestamp_ns": time_ns, "frame_id": FRAME_ID}
+    if result.xyz is not None:
+        intensity = np.zeros(len(result.xyz)) if result.intensity is None else result.intensity
+        channels.add_message(POINTS_TOPIC, point_cloud(result.xyz, intensity, **common), time_ns)
+    if result.trails is not None:
+        pose = np.array(result.record["T_world_sensor"])
+        channels.add_message(POSE_TOPIC, _transform(pose, time_ns), time_ns)
+    channels.add_message(BOXES_TOPIC, scene_update(result.record, trails=result.trails, **common), time_ns)
+    channels.add_record(RECORDS_TOPIC if result.trails is None else TRACKS_TOPIC, result.record, time_ns)
 
 
 def _transform(T_world_sensor: np.ndarray, time_ns: int) -> Any:
@@ -104,7 +136,7 @@ class _Channels:
         """Adds a record as JSON."""
         if topic not in self._ids:
             title = _TITLES[topic]
-            schema = json.dumps({"title": title, "type": "object"}).encode()
+            schema = json.dumps(record_schema(topic)).encode()
             schema = self._writer.register_schema(title, "jsonschema", schema)
             self._ids[topic] = self._writer.register_channel(topic, "json", schema)
         data = json.dumps(record, allow_nan=False).encode()

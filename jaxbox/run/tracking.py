@@ -107,7 +107,7 @@ def track(
     track_config = TrackConfig() if track_config is None else track_config
     check_ranges(track_config)
     readable = as_sweeps(sweeps, called="jaxbox.track")
-    tracker = _Tracker(track_config, provider.source, max_tracks)
+    tracker = Tracker(track_config, provider.source, max_tracks)
     begun: collections.deque[ReadableSweep] = collections.deque()
     streamed = stream(
         prepared(readable, provider, begun), config, key, capacity=capacity, workers=workers, devices=devices
@@ -120,7 +120,7 @@ def _track(
     begun: collections.deque[ReadableSweep],
     provider: PoseProvider,
     clock: Clock,
-    tracker: "_Tracker",
+    tracker: "Tracker",
 ) -> Generator[TrackedSweep, None, None]:
     # Where the caller stops early, the workers end now, and not with the last reference to them.
     with contextlib.closing(streamed):
@@ -190,10 +190,17 @@ def _step(
     return track_step(state, observe(detections), dt, T_previous_current, config)
 
 
-class _Tracker:
-    """The tracker's memory, and the last sweep and pose that it accepted."""
+class Tracker:
+    """The tracker's memory, and the last sweep and pose that it accepted: one step a sweep."""
 
     def __init__(self, config: TrackConfig, source: PoseSource, max_tracks: int) -> None:
+        """Begins without tracks.
+
+        Args:
+          config: the tracker's settings.
+          source: where the poses are from.
+          max_tracks: capacity for vehicles at a time.
+        """
         self._config = jax.tree.map(float, config)
         self._bits = _SOURCE_BITS.get(source, TrackStatus.OK)
         self._state = TrackerState.empty(max_tracks)
@@ -203,7 +210,16 @@ class _Tracker:
     def step(
         self, detections: Detections, time_ns: int, T_world_sensor: np.ndarray
     ) -> tuple[Tracks, np.ndarray]:
-        """The tracks of a sweep on the host, and its pose where that is valid."""
+        """Takes the next sweep.
+
+        Args:
+          detections: on the host.
+          time_ns: of the sweep, ns.
+          T_world_sensor: (4, 4) float64, m; invalid where it is not known.
+
+        Returns:
+          The tracks on the host; and the pose, or the last valid one where this one is not.
+        """
         is_pose = check_pose(T_world_sensor) is None
         T_now = orthonormal_pose(T_world_sensor) if is_pose else None
         motion = self._motion_to(T_now)

@@ -47,6 +47,24 @@ class TrackedFrame:
     pose_source: PoseSource
     """Where the poses are from."""
 
+    @classmethod
+    def of(cls, tracked: TrackedSweep, trails: Mapping[int, np.ndarray]) -> "TrackedFrame":
+        """What a page shows of a sweep: some kilobytes.
+
+        Args:
+          tracked: a sweep that went through.
+          trails: as the field.
+
+        Returns:
+          Its tracks.
+        """
+        assert tracked.tracks is not None
+        is_new = TrackStatus.TIME_NOT_LATER not in tracked.status
+        # A sweep that was passed over has the tracks of the one before, in the frame of that one.
+        rows = np.flatnonzero(tracked.tracks.valid & is_new)
+        vehicles = jax.tree.map(lambda field: field[rows] if np.ndim(field) else field, tracked.tracks)
+        return cls(tracks=vehicles, trails=trails, pose_source=tracked.pose_source)
+
     @property
     def status(self) -> TrackStatus:
         """What happened in the tracker."""
@@ -171,15 +189,11 @@ class _FollowedDrive:
             return None
 
     def _keep(self, tracked: TrackedSweep) -> TrackedFrame | None:
-        """What a page shows of a sweep: some kilobytes; None for one that could not be read."""
+        """What a page shows of a sweep; None for one that could not be read."""
         if tracked.tracks is None or tracked.T_world_sensor is None:
             return None
         if self._start_ns is None:
             self._start_ns = tracked.time_ns
         time_s = (tracked.time_ns - self._start_ns) / _NS_PER_S
         trails = self._trails.add(tracked.tracks, tracked.T_world_sensor, time_s)
-        is_new = TrackStatus.TIME_NOT_LATER not in tracked.status
-        # A sweep that was passed over has the tracks of the one before, in the frame of that one.
-        rows = np.flatnonzero(tracked.tracks.valid & is_new)
-        vehicles = jax.tree.map(lambda field: field[rows] if np.ndim(field) else field, tracked.tracks)
-        return TrackedFrame(tracks=vehicles, trails=trails, pose_source=tracked.pose_source)
+        return TrackedFrame.of(tracked, trails)

@@ -50,6 +50,40 @@ class Frame:
     """What could not be read besides the points, in words."""
 
     @classmethod
+    def of_points(
+        cls,
+        name: str,
+        xyz: np.ndarray,
+        intensity: np.ndarray | None,
+        *,
+        timestamp_ns: int | None = None,
+        capacity: int | None = None,
+    ) -> "Frame":
+        """A sweep that is points alone.
+
+        Args:
+          name: of the sweep.
+          xyz: (n, 3) real, m, sensor frame.
+          intensity: (n,) real, or None.
+          timestamp_ns: ns since 1970, or None.
+          capacity: points that it is padded to; None for what it needs.
+
+        Returns:
+          The frame.
+        """
+        cloud = PointCloud.from_numpy(xyz, intensity, capacity=capacity)
+        rows = _drawable_rows(cloud)
+        return cls(
+            name=name,
+            timestamp_ns=timestamp_ns,
+            num_points=len(xyz),
+            cloud=cloud,
+            rows=rows,
+            xyz=np.asarray(cloud.xyz1)[rows, :3],
+            intensity=np.asarray(cloud.intensity)[rows],
+        )
+
+    @classmethod
     def read(cls, sweep: io.Sweep, *, capacity: int | None = None) -> "Frame":
         """Reads a sweep; where only its image, calibration or labels are broken, it goes without them.
 
@@ -64,22 +98,16 @@ class Frame:
           InputError: where the points cannot be read.
         """
         start = time.perf_counter()
-        xyz, intensity = sweep.read_points()
-        cloud = PointCloud.from_numpy(xyz, intensity, capacity=capacity)
-        rows = _drawable_rows(cloud)
+        points = cls.of_points(
+            sweep.name, *sweep.read_points(), timestamp_ns=sweep.timestamp_ns, capacity=capacity
+        )
         problems: list[str] = []
         image = _attempt(sweep.read_image, problems)
         calibration = _attempt(sweep.read_calibration, problems)
         labels = _attempt(sweep.read_labels, problems)
         vehicles, others = _label_boxes(labels, calibration)
-        return cls(
-            name=sweep.name,
-            timestamp_ns=sweep.timestamp_ns,
-            num_points=len(xyz),
-            cloud=cloud,
-            rows=rows,
-            xyz=np.asarray(cloud.xyz1)[rows, :3],
-            intensity=np.asarray(cloud.intensity)[rows],
+        return dataclasses.replace(
+            points,
             calibration=calibration,
             image=image,
             vehicles=vehicles,

@@ -1,0 +1,222 @@
+"""Packets of a Velodyne sensor over UDP, as they come; the library ``velodyne-decoder`` makes points of them.
+
+Whoever reaches the port can send: packets have no signature. So it listens at this machine's loopback address
+unless another is named, and nothing that comes can do more than be a wrong point: a datagram of another size
+is refused, one that cannot be decoded is counted, a turn that does not end is dropped, and packets from
+another address than the first are refused while that one sends.
+"""
+
+import contextlib
+import dataclasses
+import pathlib
+import socket
+import struct
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from jaxbox._extras import require
+from jaxbox._files import read_text, reason
+from jaxbox.io import InputError, TimedPoints
+from jaxbox.live.sweep import IDLE_S, Fault, LiveSweep, now_ns
+
+PORT = 2368
+"""To which Velodyne sensors send unless they are told otherwise."""
+PACKET_BYTES = 1206
+"""Of each packet of points."""
+MAX_PACKETS = 8192
+"""A turn has fewer: the VLS-128 sends 12,600 a second with two returns, and turns 5 times a second."""
+_BUFFER_BYTES = 2**22
+"""Of the socket: a second of the busiest sensor."""
+_STAMP = struct.Struct("@ll")
+"""Seconds and nanoseconds, by which the kernel says when a packet came: not late, where this program is."""
+_LOST = struct.Struct("@I")
+_SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
+"""Linux's numbers, which Python does not name: packets come with their time, and with how many were lost."""
+_TIME_COLUMN = 4
+_NS_PER_S = 10**9
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class UdpAddress:
+    """Where packets come in, and from whom."""
+
+    host: str = "127.0.0.1"
+    """Address of this machine to listen at."""
+    port: int = PORT
+    """Port to listen at; 0 takes a free one."""
+    sender: str | None = None
+    """Address of the sensor; None for whoever sends first."""
+    model: str | None = None
+    """Name of the model, as ``velodyne_decoder.Model`` has it; None for what the packets say, which those of
+    an HDL-64E do not."""
+    calibration: pathlib.Path | None = None
+    """Calibration of the lasers, YAML; None for the model's own."""
+
+
+class VelodyneSource:
+    """A Velodyne sensor whose packets come in at a port; a `jaxbox.live.Source`."""
+
+    can_wait = False
+
+    def __init__(self, address: UdpAddress) -> None:
+        """Begins to listen, so that a port that is taken is known at once.
+
+        Args:
+          address: where, and to whom.
+
+        Raises:
+          InputError: for an address that cannot be listened at, an unknown model, or a bad calibration.
+          ImportError: without the extra ``velodyne``.
+        """
+        self._library = require("velodyne_decoder", extra="velodyne", what="Velodyne packets")
+        self._address = address
+        self._decoder = _Decoder(self._library, _config_of(self._library, address))
+        self._socket = _listening(address)
+        self.port: int = self._socket.getsockname()[1]
+        """At which it listens."""
+        self.name = f"udp://{address.host}:{self.port}"
+        self.hint = f"is the sensor on, and does it send to this machine at port {self.port}?"
+
+    def __iter__(self) -> Iterator[LiveSweep | Fault | None]:
+        """A sweep with the packet that ends its turn, and None with the others."""
+        sender, frame, num_lost = self._address.sender, 0, None
+        with self._socket:
+            _drain(self._socket)
+            while True:
+                received = _receive(self._socket)
+                if received is None:
+                    # Half a turn before a silence and half a turn after it are no sweep.
+                    self._decoder.reset()
+                    sender = self._address.sender
+                    yield None
+                    continue
+                packet, stamp_ns, host, lost = received
+                if num_lost is not None and lost > num_lost:
+                    yield Fault(
+                        f"{self.name}: {lost - num_lost} packets were lost; this machine is too busy."
+                    )
+                num_lost = lost
+                if sender not in (None, host):
+                    yield Fault(f"{self.name}: a packet from {host}, while {sender} is listened to.")
+                    continue
+                try:
+                    points = self._decoder.add(packet, stamp_ns)
+                except ValueError as error:
+                    yield Fault(f"{self.name}: {error} It came from {host}.")
+                    continue
+                sender = host
+                yield None if points is None else _sweep(points, frame, stamp_ns)
+                frame += points is not None
+
+
+class _Decoder:
+    """The library's decoder, which begins anew where what comes cannot be a turn."""
+
+    def __init__(self, library: Any, config: Any) -> None:
+        self._library, self._config = library, config
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the turn that was begun, and which model it was."""
+        self._stream, self._num_packets = self._library.StreamDecoder(self._config), 0
+
+    def add(self, packet: bytes, stamp_ns: int) -> TimedPoints | None:
+        """The points of a turn with its last packet, else None.
+
+        Raises:
+          ValueError: for what is no packet, or does not end a turn when it must.
+        """
+        if len(packet) != PACKET_BYTES:
+            raise ValueError(f"{len(packet)} bytes, and packets of a Velodyne sensor have {PACKET_BYTES}.")
+        try:
+            found = self._stream.decode(stamp_ns / _NS_PER_S, packet)
+        except RuntimeError as error:
+            self.reset()
+            raise ValueError(f"a packet that cannot be decoded ({reason(error)}).") from error
+        self._num_packets += 1
+        if found is None:
+            if self._num_packets > MAX_PACKETS:
+                self.reset()
+                raise ValueError(f"{MAX_PACKETS} packets, and the sensor has not turned round.")
+            return None
+        self._num_packets = 0
+        values = found[1]
+        return TimedPoints(values[:, :3], values[:, 3], values[:, _TIME_COLUMN].astype(np.float64))
+
+
+def _sweep(points: TimedPoints, frame: int, stamp_ns: int) -> LiveSweep:
+    return LiveSweep(
+        name=f"{frame:06d}", frame=frame, timestamp_ns=stamp_ns, arrived_ns=stamp_ns, points=points
+    )
+
+
+def _config_of(library: Any, address: UdpAddress) -> Any:
+    models = library.Model.__members__
+    if address.model is not None and address.model not in models:
+        raise InputError(f"model {address.model} is not known; name one of {', '.join(models)}.")
+    model = None if address.model is None else models[address.model]
+    calibration = None
+    if address.calibration is not None:
+        text = read_text(address.calibration)
+        try:
+            calibration = library.Calibration.from_string(text)
+        except RuntimeError as error:
+            raise InputError(
+                f"{address.calibration}: not a calibration of a Velodyne sensor ({reason(error)})."
+            ) from error
+    return library.Config(model=model, calibration=calibration)
+
+
+def _listening(address: UdpAddress) -> socket.socket:
+    """A socket that waits no longer than `IDLE_S`, and stamps what it receives where it can (Linux)."""
+    try:
+        family, kind, *_, place = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_DGRAM)[0]
+        found = socket.socket(family, kind)
+        try:
+            found.bind(place)
+        except BaseException:
+            found.close()
+            raise
+    except (OSError, OverflowError) as error:
+        raise InputError(
+            f"cannot listen at {address.host}, UDP port {address.port} ({error}); does another program, "
+            "or is the address not this machine's?"
+        ) from error
+    found.settimeout(IDLE_S)
+    found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+    if sys.platform == "linux":
+        found.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        found.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
+    return found
+
+
+def _drain(listening: socket.socket) -> None:
+    """Forgets what came while nobody was ready."""
+    listening.setblocking(False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            listening.recv(1)
+    listening.settimeout(IDLE_S)
+
+
+def _receive(listening: socket.socket) -> tuple[bytes, int, str, int] | None:
+    """A datagram, when it was there, ns since 1970, from which address, and how many were lost so far.
+
+    None where none came. Only Linux counts what is lost, where nobody fetches packets in time.
+    """
+    room = socket.CMSG_SPACE(_STAMP.size) + socket.CMSG_SPACE(_LOST.size)
+    try:
+        packet, extras, _, sender = listening.recvmsg(2 * PACKET_BYTES, room)
+    except TimeoutError:
+        return None
+    stamp_ns, num_lost = now_ns(), 0
+    for _, kind, data in extras:
+        if kind == _SO_TIMESTAMPNS and len(data) == _STAMP.size:
+            seconds, nanoseconds = _STAMP.unpack(data)
+            stamp_ns = seconds * _NS_PER_S + nanoseconds
+        elif kind == _SO_RXQ_OVFL:
+            (num_lost,) = _LOST.unpack(data)
+    return packet, stamp_ns, sender[0], num_lost
