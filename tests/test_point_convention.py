@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from jaxbox import DetectorConfig, io
 from jaxbox.cli.app import app
+from jaxbox.cli.box_filter import BoxFilter
 from jaxbox.cli.inputs import RunOptions, prepare_run
 from jaxbox.geometry.rigid import rotation_about_z
 from jaxbox.io import PointConvention
@@ -225,6 +226,9 @@ def test_a_run_is_resumed_with_its_own_convention(tmp_path):
             level=False,
             capacity=None,
             min_score=0.0,
+            keep=BoxFilter(),
+            crops=False,
+            sheet=False,
             quiet=True,
             json=False,
             **changes,

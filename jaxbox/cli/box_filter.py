@@ -35,8 +35,8 @@ _RECTANGLE = 4
 class BoxFilter:
     """Which boxes are kept.
 
-    >>> BoxFilter.chosen(classes="car,vans", within="-10,60,-20,20").recorded()
-    {'classes': ['car', 'van'], 'within': [[60.0, 20.0], [-10.0, 20.0], [-10.0, -20.0], [60.0, -20.0]]}
+    >>> BoxFilter.chosen(classes="cars", within="-10,60,-20,20").recorded()
+    {'classes': ['car'], 'within': [[60.0, 20.0], [-10.0, 20.0], [-10.0, -20.0], [60.0, -20.0]]}
     """
 
     classes: tuple[str, ...] | None = None
