@@ -17,7 +17,7 @@ import plyfile
 import pyarrow as pa
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
-from pyarrow import feather
+from pyarrow import feather, parquet
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
@@ -150,6 +150,14 @@ def write_feather(folder: pathlib.Path) -> None:
     table = pa.table({**columns, "intensity": np.arange(NUM_POINTS, dtype=np.uint8)})
     for compression in ("uncompressed", "lz4", "zstd"):
         feather.write_feather(table, folder / f"{compression}.feather", compression=compression)
+
+
+def write_parquet_points(folder: pathlib.Path) -> None:
+    """Plain and packed, in two groups of rows."""
+    table = pa.table(dict(zip(NAMES, POINTS.T, strict=True)))
+    for compression in ("none", "snappy", "zstd"):
+        path = folder / f"{compression}.parquet"
+        parquet.write_table(table, path, compression=compression, row_group_size=7)
 
 
 def write_feather_calibration(folder: pathlib.Path) -> None:
@@ -524,6 +532,7 @@ TARGETS: Mapping[str, Target] = {
     "npy": points_target(".npy", write_npy),
     "npz": points_target(".npz", write_npz),
     "feather": points_target(".feather", write_feather),
+    "parquet_points": points_target(".parquet", write_parquet_points),
     "feather_calibration": Target(
         "calibration/egovehicle_SE3_sensor.feather",
         read_calibrated_feather,

@@ -13,12 +13,13 @@ import pyarrow as pa
 import pypcd4
 import pytest
 from mcap.writer import Writer as McapWriter
-from pyarrow import feather
+from pyarrow import feather, parquet
 from rosbags import rosbag1, rosbag2
 from rosbags.typesys import Stores, get_typestore
 
 from jaxbox import io
 from jaxbox.io import foxglove, pointcloud2, points
+from jaxbox.io.parquet import TRACK_COLUMNS, open_parquet
 
 XYZ = np.float32([[1.5, -2, 0.25], [30, 4, -1.75], [np.nan, np.inf, 7]])
 INTENSITY = np.float32([0.25, 0.5, 9])
@@ -55,7 +56,15 @@ def write_structured(path):
     np.save(path, record)
 
 
+def write_parquet(path):
+    """In groups of rows, with a column of another type, one that is missing once, and capital letters."""
+    columns = {"X": XYZ[:, 0].astype(np.float64), "Y": XYZ[:, 1], "Z": XYZ[:, 2], "Intensity": INTENSITY}
+    table = pa.table({"name": ["a", None, "c"], **columns, "ring": RING})
+    parquet.write_table(table, path, row_group_size=2)
+
+
 WRITERS = {
+    "a.parquet": write_parquet,
     "ascii.pcd": lambda path: write_pcd(path, "ascii"),
     "binary.pcd": lambda path: write_pcd(path, "binary"),
     "compressed.PCD": lambda path: write_pcd(path, "binary_compressed"),
@@ -173,6 +182,25 @@ def test_a_table_that_is_no_sweep_of_a_log_is_taken_as_it_is_whatever_lies_near_
     assert not io.read_timed_points(tmp_path / folder / "a.feather").is_compensated
 
 
+def test_tables_of_boxes_and_of_other_things_are_no_points(tmp_path):
+    folder = tmp_path / "drive"
+    folder.mkdir()
+    with open_parquet(folder / "detections.parquet"):
+        pass
+    with pytest.raises(io.InputError, match=r"detections.parquet: holds boxes, as jaxbox writes its results"):
+        io.open_sweeps(folder)[0].read_points()
+    with open_parquet(folder / "tracks.parquet", columns=TRACK_COLUMNS):
+        pass
+    with pytest.raises(io.InputError, match=r"tracks.parquet: holds boxes"):
+        io.read_points(folder / "tracks.parquet")
+    # Results beside the points that they are of are passed over.
+    np.save(folder / "a.npy", FINITE)
+    assert [sweep.name for sweep in io.open_sweeps(folder)] == ["a"]
+    parquet.write_table(pa.table({"x": [1.0], "name": ["a"], "z": [None]}), tmp_path / "b.parquet")
+    with pytest.raises(io.InputError, match=r"b.parquet: no field y among x, z"):
+        io.read_points(tmp_path / "b.parquet")
+
+
 def test_the_real_pcd_is_the_binary_frame_and_a_spurious_point(data_root):
     pcd, intensity = io.read_points(data_root / "pcd" / "2011_09_26_drive_0005_0000000010.pcd")
     frame, frame_intensity = io.read_points(data_root / "kitti_tracking/training/velodyne/0000/000010.bin")
@@ -232,6 +260,7 @@ BAD = {
     "text.npy": ("no array", r"no readable \.npy array"),
     "text.npz": ("no archive", r"no readable \.npz file"),
     "text.feather": ("no table", "no readable Feather table"),
+    "text.parquet": ("no table", "no readable Parquet table"),
     "text.pcd.bin": ("x" * 16, "not a multiple of 20"),
     "text.bag": ("no bag", "the bag cannot be read"),
     "text.db3": ("no bag", "the bag cannot be read"),
@@ -287,6 +316,7 @@ EXTRAS = {
     "a.pcd": ("pypcd4", "pcd"),
     "a.las": ("laspy", "las"),
     "a.feather": ("pyarrow", "arrow"),
+    "a.parquet": ("pyarrow", "arrow"),
     "a.bag": ("rosbags.rosbag1", "ros"),
     "a.mcap": ("mcap.reader", "mcap"),
 }

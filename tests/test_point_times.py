@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 import pypcd4
 import pytest
-from pyarrow import feather
+from pyarrow import feather, parquet
 from test_io_formats import (
     CLOUD,
     INTENSITY,
@@ -98,6 +98,12 @@ def write_csv(path):
     path.write_text("\n".join(["x,y,z,intensity,ring,time", *rows]))
 
 
+def write_parquet(path):
+    columns = dict(zip("xyz", XYZ.T, strict=True))
+    times = np.uint32(OFFSETS_S * 1e9)
+    parquet.write_table(pa.table({**columns, "intensity": INTENSITY, "t": times}), path)
+
+
 def write_feather(path):
     columns = {name: XYZ[:, i] for i, name in enumerate("xyz")}
     table = pa.table({**columns, "intensity": INTENSITY, "offset_ns": np.int32(OFFSETS_S * 1e9)})
@@ -114,6 +120,7 @@ WRITERS = {
         path, x=XYZ[:, 0], y=XYZ[:, 1], z=XYZ[:, 2], intensity=INTENSITY, t=np.uint32(OFFSETS_S * 1e9)
     ),
     "315966265259836000.feather": write_feather,
+    "a.parquet": write_parquet,
     "a.ply": lambda path: path.write_text(
         "ply\nformat ascii 1.0\nelement vertex 3\n"
         + "".join(f"property double {name}\n" for name in ("x", "y", "z", "intensity", "time"))

@@ -124,9 +124,9 @@ def detect(
     paths: Annotated[
         list[str],
         typer.Argument(
-            help="Sweeps (.bin .pcd.bin .pcd .ply .las .laz .npy .npz .feather .txt .csv .xyz), recordings "
-            "(.bag .db3 .mcap .pcap .pcapng .osf, ROS 2 folders), folders of them, data sets' folders, or "
-            "patterns in quotes; docs/formats.md.",
+            help="Sweeps (.bin .pcd.bin .pcd .ply .las .laz .npy .npz .feather .parquet .txt .csv .xyz), "
+            "recordings (.bag .db3 .mcap .pcap .pcapng .osf, ROS 2 folders), folders of them, data sets' "
+            "folders, or patterns in quotes; docs/formats.md.",
         ),
     ],
     *,

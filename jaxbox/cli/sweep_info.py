@@ -3,12 +3,14 @@
 import dataclasses
 import json
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 
 from jaxbox import io
 from jaxbox._padding import fitting_capacity
+from jaxbox.cli.doubts import doubts_about
 from jaxbox.config import DetectorConfig, propose_capacities
 from jaxbox.config.capacities import capacity_sizes
 from jaxbox.config.fields import changed_fields
@@ -62,6 +64,13 @@ class SweepInfo:
     """Of the sensor above the ground round it."""
     tilt_deg: float | None
     """Between z and the ground's normal."""
+    doubts: tuple[str, ...]
+    """What of units, axes and origin looks wrong, with the options that mend it."""
+
+    @property
+    def has_ground(self) -> bool:
+        """Whether there is a ground below the sensor, without which nothing is found."""
+        return self.sensor_height_m is not None and self.sensor_height_m >= -GROUND_ABOVE_M
 
 
 def look_at(
@@ -104,6 +113,7 @@ def look_at(
         spacing_deg=spacing_deg,
         sensor_height_m=None if mounting is None else round(mounting.height_m or 0.0, 2),
         tilt_deg=None if mounting is None else round(mounting.tilt_deg, 1),
+        doubts=doubts_about(seen, mounting),
     )
 
 
@@ -208,34 +218,46 @@ def print_sweep_info(sweeps: Sequence[io.Sweep], *, num_sweeps: int, as_json: bo
         xyz, intensity = sweep.read_points()
         clouds.append(xyz)
         infos.append(look_at(sweep.name, xyz, intensity, timestamp_ns=sweep.timestamp_ns))
-    beams = fitting_beams(infos)
-    options = advised_options(infos, beams)
-    if LEVEL_OPTION in options:
-        clouds = [(measure_mounting(xyz) or Mounting()).raised().level(xyz) for xyz in clouds]
-    changes = capacity_changes(clouds, base=DetectorConfig.for_sensor(beams))
-    capacity = fitting_capacity(max(len(xyz) for xyz in clouds))
+    fits = _fitting(infos, clouds)
     if as_json:
         found = [dataclasses.asdict(info) for info in infos]
-        fits = {
-            "preset": "default",
-            "sensor": beams,
-            "capacity": capacity,
-            "settings": changes,
-            "options": options,
-        }
         console.out(json.dumps({"num_sweeps": len(sweeps), "sweeps": found, "fits": fits}), highlight=False)
         return
     console.print(f"{len(sweeps)} sweeps, {len(infos)} looked at", markup=False)
     for info in infos:
         for line in describe(info):
             console.print(line, markup=False)
-    console.print(f"fits: preset default for {beams} beams, padded to {capacity} points", markup=False)
-    if options:
-        console.print(f"  jaxbox detect ... {' '.join(options)}", markup=False)
-    for name, value in changes.items():
-        console.print(f"  {name} = {value}", markup=False)
-    if changes:
-        console.print("  (the preset's capacities are too small: put these lines in a file for --config)")
+    for line in _describe_fitting(fits):
+        console.print(line, markup=False)
+
+
+def _fitting(infos: Sequence[SweepInfo], clouds: list[np.ndarray]) -> dict[str, Any] | None:
+    """Settings and options for sweeps like these; None without a ground, where none would fit."""
+    if not any(info.has_ground for info in infos):
+        return None
+    beams = fitting_beams(infos)
+    options = advised_options(infos, beams)
+    if LEVEL_OPTION in options:
+        clouds = [(measure_mounting(xyz) or Mounting()).raised().level(xyz) for xyz in clouds]
+    return {
+        "preset": "default",
+        "sensor": beams,
+        "capacity": fitting_capacity(max(len(xyz) for xyz in clouds)),
+        "settings": capacity_changes(clouds, base=DetectorConfig.for_sensor(beams)),
+        "options": options,
+    }
+
+
+def _describe_fitting(fits: dict[str, Any] | None) -> list[str]:
+    if fits is None:
+        return ["nothing fits yet: without a ground below the sensor nothing would be found"]
+    lines = [f"fits: preset default for {fits['sensor']} beams, padded to {fits['capacity']} points"]
+    if fits["options"]:
+        lines.append(f"  jaxbox detect ... {' '.join(fits['options'])}")
+    lines += [f"  {name} = {value}" for name, value in fits["settings"].items()]
+    if fits["settings"]:
+        lines.append("  (the preset's capacities are too small: put these lines in a file for --config)")
+    return lines
 
 
 def advised_options(infos: Sequence[SweepInfo], beams: int) -> list[str]:
@@ -280,12 +302,12 @@ def describe(info: SweepInfo) -> list[str]:
     beams += f", {info.spacing_deg:.2f} degrees apart" if info.spacing_deg else ""
     down, up = info.elevation_deg
     lines.append(f"  {beams}, elevation {down:.1f} to {up:.1f} degrees")
+    doubts = [f"  doubtful: {doubt}" for doubt in info.doubts]
     height = info.sensor_height_m
-    if height is None:
-        return [*lines, "  no ground plane round the sensor: is z up, and the sensor at the origin?"]
-    if height < -GROUND_ABOVE_M:
-        return [*lines, f"  the ground lies {-height:.2f} m above the sensor: upside down, or z points down?"]
+    if height is None or not info.has_ground:
+        return [*lines, *doubts]
     lines.append(f"  sensor {height:.2f} m above the ground, tilted {info.tilt_deg:.1f} degrees")
+    lines += doubts
     if height < MIN_SENSOR_HEIGHT_M:
         lines.append(
             "  the origin is close to the ground: is this a vehicle's frame? The detector looks from the "

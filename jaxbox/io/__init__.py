@@ -39,6 +39,7 @@ from jaxbox.io.levelled import LevelSweeps, measure_sweeps
 from jaxbox.io.npy import read_npy, read_npz
 from jaxbox.io.nuscenes import read_nuscenes
 from jaxbox.io.pandaset import read_pandaset_boxes, read_pandaset_points
+from jaxbox.io.parquet_points import read_parquet_points
 from jaxbox.io.pcd import read_pcd, write_pcd
 from jaxbox.io.ply import read_ply
 from jaxbox.io.points import TimedPoints, read_bin, write_bin
@@ -101,6 +102,7 @@ __all__ = [
     "read_oxts",
     "read_pandaset_boxes",
     "read_pandaset_points",
+    "read_parquet_points",
     "read_pcd",
     "read_ply",
     "read_points",

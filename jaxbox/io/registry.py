@@ -11,12 +11,24 @@ from jaxbox.io.argoverse2 import FEATHER
 from jaxbox.io.las import LAS
 from jaxbox.io.npy import NPY, NPZ
 from jaxbox.io.nuscenes import NUSCENES
+from jaxbox.io.parquet_points import PARQUET_POINTS
 from jaxbox.io.pcd import PCD
 from jaxbox.io.ply import PLY
 from jaxbox.io.points import BIN, PointFormat, Points, TimedPoints
 from jaxbox.io.text_points import TEXT
 
-POINT_FORMATS: tuple[PointFormat, ...] = (BIN, NUSCENES, PCD, PLY, LAS, NPY, NPZ, FEATHER, TEXT)
+POINT_FORMATS: tuple[PointFormat, ...] = (
+    BIN,
+    NUSCENES,
+    PCD,
+    PLY,
+    LAS,
+    NPY,
+    NPZ,
+    FEATHER,
+    PARQUET_POINTS,
+    TEXT,
+)
 """Formats in the order in which a folder is searched for them."""
 
 POINT_SUFFIXES: tuple[str, ...] = tuple(

@@ -35,6 +35,7 @@ from jaxbox.io.kitti import tracking_name
 from jaxbox.io.kitti_calibration import RAW_CALIBRATION_FILES
 from jaxbox.io.mcap import MCAP
 from jaxbox.io.ouster import OSF
+from jaxbox.io.parquet_points import PARQUET_POINTS
 from jaxbox.io.points import PointFormat
 from jaxbox.io.recordings import RecordedSweeps, RecordingFormat
 from jaxbox.io.registry import POINT_FORMATS, POINT_SUFFIXES, format_of, suffix_of
@@ -59,6 +60,9 @@ _FOLDERS = (
     "pointclouds", "lidar_point_cloud_0", "*/lidar_point_cloud_0",
 )  # fmt: skip
 """Where points may lie below a given folder, after the folder itself."""
+
+_LAST = (PARQUET_POINTS, TEXT)
+"""Formats after which a folder is searched when nothing else is in it: they may be results, or notes."""
 
 _SEARCHED = tuple(folder for folder in _FOLDERS if folder != "*")
 
@@ -146,12 +150,11 @@ def _open_path(path: pathlib.Path, topic: str | None) -> list[Sequence[Sweep]]:
         if path.exists():
             check_file(path, max_bytes=None)
         raise InputError(f"{path}: there is no such file or folder; check the path.")
-    if files := _find_points(path, POINT_FORMATS[:-1]):
+    if files := _find_points(path, [kind for kind in POINT_FORMATS if kind not in _LAST]):
         return [tuple(_sweep_at(file) for file in files)]
-    # Text comes last: it may as well be somebody's notes.
     if recordings := [file for file in sorted(path.iterdir()) if recording_format(file)]:
         return [part for file in recordings for part in _open_path(file, topic)]
-    if files := _find_points(path, (TEXT,)):
+    if files := _find_points(path, _LAST):
         return [tuple(_sweep_at(file) for file in files)]
     raise InputError(
         f"{path}: no points there. Give a point file ({', '.join(POINT_SUFFIXES)}), a recording "
