@@ -5,6 +5,7 @@ import dataclasses
 import importlib
 import json
 import pathlib
+import struct
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -31,6 +32,7 @@ from jaxbox.io.pose_track import UnusableSource
 from jaxbox.io.recorded_poses import collect_poses, odometry_poses, tf_poses
 from jaxbox.io.results import ResultFile, SweepResult
 from jaxbox.io.rosbag import MessageDecoder, decode_message
+from jaxbox.io.velodyne import calibrated_sensor, decode_packets
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 STORES = {1: get_typestore(Stores.ROS1_NOETIC), 2: get_typestore(Stores.ROS2_HUMBLE)}
@@ -234,6 +236,56 @@ def write_storage(folder: pathlib.Path, **options: Any) -> None:
         write_bag2(pathlib.Path(root), **options)
         for file in pathlib.Path(root, "drive").iterdir():
             (folder / file.name).write_bytes(file.read_bytes())
+
+
+def velodyne_packets() -> list[bytes]:
+    """A turn of an HDL-32E in few packets."""
+    rng = np.random.default_rng(0)
+    sent = []
+    for number in range(10):
+        blocks = bytearray()
+        for block in range(12):
+            azimuth = 3600 * number + 300 * block
+            blocks += struct.pack("<HH", 0xEEFF, azimuth) + rng.integers(0, 256, 96, np.uint8).tobytes()
+        sent.append(bytes(blocks) + struct.pack("<IBB", 10_000 * number, 0x37, 0x21))
+    return sent
+
+
+def write_captures(folder: pathlib.Path) -> None:
+    """The same in the classic format and the newer one, each with an odd frame."""
+    classic = struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 2**16, 1)
+    newer = struct.pack("<IIIHHqI", 0x0A0D0D0A, 28, 0x1A2B3C4D, 1, 0, -1, 28)
+    newer += struct.pack("<IIHHIHHB3xI", 1, 28, 1, 0, 2**16, 9, 1, 9, 28)
+    for number, payload in enumerate([b"short", *velodyne_packets()]):
+        length = len(payload)
+        frame = bytes(12) + b"\x08\x00" + struct.pack(">BBHIBB10x", 0x45, 0, 28 + length, 0, 64, 17)
+        frame += struct.pack(">HHHH", 2368, 2368, 8 + length, 0) + payload
+        classic += struct.pack("<IIII", 1, 10_000 * number, len(frame), len(frame)) + frame
+        padded = frame + bytes(-len(frame) % 4)
+        size = 32 + len(padded)
+        newer += struct.pack("<IIIIIII", 6, size, 0, 0, number, len(frame), len(frame))
+        newer += padded + struct.pack("<I", size)
+    (folder / "a.pcap").write_bytes(classic)
+    (folder / "a.pcapng").write_bytes(newer)
+
+
+def capture_target(name: str) -> Target:
+    """One of `write_captures`."""
+    return Target(name, read_sweeps, lambda: {name: written(write_captures)[name]})
+
+
+def velodyne_calibration() -> bytes:
+    """Of 16 lasers, as ROS's driver has it."""
+    fields = ("rot_correction", "vert_correction", "dist_correction", "vert_offset_correction")
+    lasers = [{"laser_id": laser, **dict.fromkeys(fields, 0.01)} for laser in range(16)]
+    return json.dumps({"num_lasers": 16, "distance_resolution": 0.002, "lasers": lasers}).encode()
+
+
+def read_calibrated(path: pathlib.Path) -> None:
+    """Decodes with what is read."""
+    sensor = calibrated_sensor(path.with_suffix(".pcap"))
+    packets = [(0, data[:-1] + b"\x22") for data in velodyne_packets()]
+    decode_packets(packets, sensor, "here")
 
 
 def write_mcap(folder: pathlib.Path) -> None:
@@ -493,6 +545,11 @@ TARGETS: Mapping[str, Target] = {
         lambda folder: write_storage(folder, storage="MCAP"),
     ),
     "mcap": Target("a.mcap", read_sweeps, lambda: written(write_mcap)),
+    "pcap": capture_target("a.pcap"),
+    "pcapng": capture_target("a.pcapng"),
+    "velodyne_calibration": Target(
+        "a.yaml", read_calibrated, lambda: {"calibration": velodyne_calibration()}
+    ),
     "ros_message": Target("a.cdr", read_message, lambda: {"ros2": serialized(2), "ros1": serialized(1)}),
     "foxglove_message": Target(
         "a.pb",

@@ -131,13 +131,14 @@ def write_pcap(path: pathlib.Path, packets: Iterable[tuple[float, bytes]], *, po
     with path.open("wb") as file:
         file.write(struct.pack("<IHHiIII", 0xA1B2C3D4, 2, 4, 0, 0, 2**16, 1))
         for time_s, payload in packets:
-            frame = _udp_frame(payload, port)
+            frame = udp_frame(payload, port)
             micros = round(time_s * 1e6)
             file.write(struct.pack("<IIII", micros // 10**6, micros % 10**6, len(frame), len(frame)))
             file.write(frame)
 
 
-def _udp_frame(payload: bytes, port: int) -> bytes:
+def udp_frame(payload: bytes, port: int) -> bytes:
+    """A datagram of a sensor at 192.168.1.201, as a frame of Ethernet."""
     ethernet = b"\xff" * 6 + bytes.fromhex("60 76 88 00 00 01 08 00")
     addresses = bytes([192, 168, 1, 201]) + b"\xff" * 4
     ip = struct.pack(">BBHHHBBH", 0x45, 0, 28 + len(payload), 0, 0, 64, 17, 0) + addresses

@@ -48,5 +48,7 @@ def test_the_corpus_belongs_to_readers_that_there_are():
 def test_every_format_and_result_that_is_read_back_is_fuzzed():
     suffixes = {"".join(pathlib.Path(target.file_name).suffixes) for target in TARGETS.values()}
     one_reader = {".csv": ".xyz", ".txt": ".xyz"}
-    for suffix in (*io.POINT_SUFFIXES, *io.RECORDING_SUFFIXES, ".toml", ".jsonl", ".parquet"):
+    # Its library is in no environment with the others, and may end the process: docs/formats.md.
+    recordings = [suffix for suffix in io.RECORDING_SUFFIXES if suffix != ".osf"]
+    for suffix in (*io.POINT_SUFFIXES, *recordings, ".toml", ".jsonl", ".parquet"):
         assert one_reader.get(suffix, suffix) in suffixes

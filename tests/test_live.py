@@ -373,6 +373,18 @@ def test_packets_are_the_points_of_their_turns():
     assert listening.faults == []
 
 
+def test_a_capture_is_the_same_sweeps_at_their_own_pace(tmp_path):
+    start_s = lidar_packets.START_S
+    times_s = [start_s + 0.1 * turn + 0.1 * place / 75 for turn in range(4) for place in range(75)]
+    packets = zip(times_s, itertools.chain.from_iterable(turns()), strict=True)
+    lidar_packets.write_pcap(tmp_path / "drive.pcap", packets)
+    found = came(open_source(str(tmp_path / "drive.pcap")))
+    assert len(found) >= 3
+    steps = np.diff([item.arrived_ns / NS for item in found])[:2]
+    assert (steps >= 0.09).all()
+    np.testing.assert_allclose(np.diff([item.timestamp_ns for item in found])[:2], NS / 10, rtol=0.02)
+
+
 def test_a_sensor_that_stops_in_the_middle_of_a_turn_goes_on_with_whole_ones():
     with Listening() as listening:
         listening.send([*turns()[0], *turns()[1][:40]])

@@ -76,7 +76,8 @@ def test_the_tested_oldest_versions_are_those_that_the_project_allows():
     tested = dict(line.split("==") for line in lines if line and line[0] != "#")
     project = tomllib.loads((PROJECT / "pyproject.toml").read_text())["project"]
     extras = project["optional-dependencies"]
-    used = ["reference", "plots", "pcd", "las", "arrow", "ros", "mcap"]  # as .ci/run installs the wheel
+    # As .ci/run installs the wheel.
+    used = ["reference", "plots", "pcd", "las", "arrow", "ros", "mcap", "velodyne"]
     wanted = [*project["dependencies"], *(item for name in used for item in extras[name])]
     bounds = dict(
         re.match(r"([\w-]+)(?:\[\w+\])?>=([\d.]+)", item).groups() for item in wanted if ">=" in item

@@ -18,14 +18,18 @@ from jaxbox.cli.live_command import LIVE_EXAMPLES, live
 from jaxbox.cli.options import (
     EXIT_CODES,
     AddressOption,
+    AxesOption,
     CapacityOption,
+    ColumnsOption,
     DrivesOption,
     Engine,
     EngineOption,
+    FlipOption,
     JsonOption,
     LevelOption,
     PresetOption,
     QuietOption,
+    ScaleOption,
     SensorAtOption,
     SensorOption,
     SetOption,
@@ -42,7 +46,7 @@ from jaxbox.cli.view import ViewOptions, run_view
 from jaxbox.cluster.dataset import SWEEPS_PER_PARTITION
 from jaxbox.evaluation.copies import COPIES
 from jaxbox.evaluation.objectives import OBJECTIVES
-from jaxbox.io import InputError
+from jaxbox.io import ORDINARY, InputError, PointConvention, open_sweeps
 from jaxbox.run.cache import enable_cache
 
 DETECT_EXAMPLES = """Examples:
@@ -116,8 +120,8 @@ def detect(
         list[str],
         typer.Argument(
             help="Sweeps (.bin .pcd.bin .pcd .ply .las .laz .npy .npz .feather .txt .csv .xyz), recordings "
-            "(.bag .db3 .mcap, ROS 2 folders), folders of them, data sets' folders, or patterns in quotes; "
-            "docs/formats.md.",
+            "(.bag .db3 .mcap .pcap .pcapng .osf, ROS 2 folders), folders of them, data sets' folders, or "
+            "patterns in quotes; docs/formats.md.",
         ),
     ],
     *,
@@ -138,6 +142,10 @@ def detect(
     topic: TopicOption = None,
     sensor_at: SensorAtOption = None,
     level: LevelOption = False,
+    scale: ScaleOption = 1.0,
+    axes: AxesOption = "ros",
+    flip: FlipOption = "",
+    columns: ColumnsOption = None,
     capacity: CapacityOption = None,
     min_score: Annotated[
         float,
@@ -192,6 +200,7 @@ def detect(
     """
     with input_errors():
         config = chosen_config(preset, settings, changes or [], sensor=sensor)
+        convention = PointConvention(scale, axes, flip, columns)
         if engine is Engine.RAY:
             ray_options = DetectRayOptions(
                 output=output,
@@ -199,7 +208,7 @@ def detect(
                 formats=frozenset(result_format or []),
                 pictures=bool(pictures),
                 points=points,
-                mounted=level or sensor_at is not None,
+                mounted=level or sensor_at is not None or convention != ORDINARY,
                 address=address,
                 jobs=jobs,
                 sweeps_per_partition=sweeps_per_partition or SWEEPS_PER_PARTITION,
@@ -223,6 +232,7 @@ def detect(
             topic=topic,
             sensor_at=sensor_at,
             level=level,
+            convention=convention,
             capacity=capacity,
             min_score=min_score,
             points=True if points is None else points,
@@ -265,6 +275,10 @@ def tune(
     sensor: SensorOption = None,
     settings: SettingsOption = None,
     changes: SetOption = None,
+    scale: ScaleOption = 1.0,
+    axes: AxesOption = "ros",
+    flip: FlipOption = "",
+    columns: ColumnsOption = None,
     seed: Annotated[int, typer.Option(min=0, help="Another number tries other settings.")] = 0,
 ) -> None:
     """Search settings on labelled sweeps, and evaluate them on held-out drives.
@@ -287,6 +301,7 @@ def tune(
             copies=copies,
             objective=objective,
             drives=drives,
+            convention=PointConvention(scale, axes, flip, columns),
             seed=seed,
         )
         raise typer.Exit(run_tune(labels, options, stdout()))
@@ -323,6 +338,10 @@ def info(
     ] = None,
     *,
     topic: TopicOption = None,
+    scale: ScaleOption = 1.0,
+    axes: AxesOption = "ros",
+    flip: FlipOption = "",
+    columns: ColumnsOption = None,
     num_sweeps: Annotated[
         int, typer.Option("--sweeps", min=1, help="Sweeps to look at, spread over all there are.")
     ] = 1,
@@ -335,7 +354,8 @@ def info(
     """
     with input_errors():
         if paths:
-            print_sweep_info(paths, topic=topic, num_sweeps=num_sweeps, as_json=json, console=stdout())
+            sweeps = open_sweeps(paths, topic=topic, convention=PointConvention(scale, axes, flip, columns))
+            print_sweep_info(sweeps, num_sweeps=num_sweeps, as_json=json, console=stdout())
         else:
             print_info(stdout(), as_json=json)
 
@@ -359,6 +379,10 @@ def view(
     topic: TopicOption = None,
     sensor_at: SensorAtOption = None,
     level: LevelOption = False,
+    scale: ScaleOption = 1.0,
+    axes: AxesOption = "ros",
+    flip: FlipOption = "",
+    columns: ColumnsOption = None,
     capacity: CapacityOption = None,
     min_score: Annotated[
         float,
@@ -378,6 +402,7 @@ def view(
             topic=topic,
             sensor_at=sensor_at,
             level=level,
+            convention=PointConvention(scale, axes, flip, columns),
             capacity=capacity,
             min_score=min_score,
             track=track,

@@ -32,6 +32,8 @@ class RunOptions:
     """Where the sensor is in the frame of the points, m; None for the origin."""
     level: bool
     """Whether its tilt is measured, and the sweeps are seen upright."""
+    convention: io.PointConvention = io.ORDINARY
+    """How the numbers of the points are to be taken."""
     capacity: int | None
     """Points a sweep is padded to, or None for what it needs."""
     min_score: float
@@ -72,7 +74,7 @@ def prepare_run(
     Raises:
       InputError: where a path holds no sweeps, or the options cannot be used.
     """
-    sweeps = io.open_sweeps(paths, topic=options.topic)
+    sweeps = io.open_sweeps(paths, topic=options.topic, convention=options.convention)
     account = RunAccount(
         output=options.output,
         config=options.config,
@@ -82,6 +84,7 @@ def prepare_run(
             "topic": options.topic,
             "sensor_at": None if options.sensor_at is None else list(options.sensor_at),
             "level": options.level,
+            "convention": dataclasses.asdict(options.convention),
             **(more or {}),
         },
         inputs=tuple(paths),

@@ -42,6 +42,8 @@ class LiveOptions:
     """Settings of detector, poses and tracker."""
     topic: str | None
     """Topic of the points in recordings."""
+    convention: io.PointConvention
+    """How the numbers of the points are to be taken."""
     rate_hz: float
     """Sweeps a second of recordings without times."""
     loop: bool
@@ -185,11 +187,13 @@ def _open(source: str, options: LiveOptions) -> Source:
     position = options.sensor_at or (0.0, 0.0, 0.0)
     if is_sensor(source):
         sensor = open_sensor(source)
-        if not options.level and not any(position):
-            return sensor
-        return MountedSource(sensor, position=position, level=options.level, report=tell)
+        return MountedSource(
+            sensor, position=position, level=options.level, convention=options.convention, report=tell
+        )
     sweeps, mounting = seen_from_sensor(
-        io.open_sweeps(source, topic=options.topic), sensor_at=options.sensor_at, level=options.level
+        io.open_sweeps(source, topic=options.topic, convention=options.convention),
+        sensor_at=options.sensor_at,
+        level=options.level,
     )
     if mounting is not None:
         tell(mounting)

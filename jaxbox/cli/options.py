@@ -78,6 +78,23 @@ SensorAtOption = Annotated[
 LevelOption = Annotated[
     bool, typer.Option("--level", help="Measure how the sensor is tilted, and see the sweeps upright.")
 ]
+ScaleOption = Annotated[
+    float, typer.Option(help="Metres of the points' unit: 0.001 for millimetres, 0.3048 for feet.")
+]
+AxesOption = Annotated[
+    str,
+    typer.Option(
+        metavar="ros|camera|ned|enu|X,Y,Z",
+        help="The points' axes: camera is x right, y down, z forward; ned y right, z down; enu x right, y "
+        "forward; or x, y, z by theirs, as -y,x,z.",
+    ),
+]
+FlipOption = Annotated[
+    str, typer.Option(metavar="AXES", help="Mirror axes, as z or xy, after --axes; for left-handed sources.")
+]
+ColumnsOption = Annotated[
+    int | None, typer.Option(help="float32 a point in .bin files; by default the numbers tell 4, 5 and 6.")
+]
 CapacityOption = Annotated[
     int | None,
     typer.Option(min=1, help="Points a sweep is padded to; by default what it needs. One compile each."),

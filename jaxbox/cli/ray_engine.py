@@ -33,7 +33,7 @@ class RayOptions:
     points: bool | None
     """Whether the points were asked for; None where nothing was said, as Parquet holds none."""
     mounted: bool
-    """Whether the sensor is to be seen level, or elsewhere; sweeps are taken as they are."""
+    """Whether points are to be seen level, from elsewhere, or otherwise than as they are, which none can."""
     address: str | None
     """Of the cluster; None to start one here."""
     jobs: int | None
@@ -64,7 +64,8 @@ class RayOptions:
         """
         if self.mounted:
             raise InputError(
-                "--level and --sensor-at: --engine ray takes sweeps as they are; leave these out."
+                "--level, --sensor-at, --scale, --axes, --flip and --columns: --engine ray takes sweeps as "
+                "they are; leave these out."
             )
         if other := self.formats - {_PARQUET}:
             raise InputError(

@@ -190,22 +190,18 @@ def capacity_changes(
     return {name: proposed[name] for name, value in needed.items() if value > sizes.get(name, value)}
 
 
-def print_sweep_info(
-    paths: Sequence[str], *, topic: str | None, num_sweeps: int, as_json: bool, console: Console
-) -> None:
+def print_sweep_info(sweeps: Sequence[io.Sweep], *, num_sweeps: int, as_json: bool, console: Console) -> None:
     """Looks at some sweeps and prints what they are like.
 
     Args:
-      paths: what `jaxbox.io.open_sweeps` takes.
-      topic: of the points in recordings.
+      sweeps: as `jaxbox.io.open_sweeps` gives them.
       num_sweeps: how many are looked at, spread over all.
       as_json: whether JSON is printed.
       console: where it goes.
 
     Raises:
-      InputError: where there are no sweeps, or one cannot be read.
+      InputError: where one cannot be read.
     """
-    sweeps = io.open_sweeps(paths, topic=topic)
     step = max(1, -(-len(sweeps) // num_sweeps))
     clouds, infos = [], []
     for sweep in sweeps[::step]:

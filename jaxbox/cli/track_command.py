@@ -9,13 +9,17 @@ from jaxbox.cli.config_options import chosen_config, chosen_track_config, comple
 from jaxbox.cli.console import input_errors
 from jaxbox.cli.options import (
     AddressOption,
+    AxesOption,
     CapacityOption,
+    ColumnsOption,
     Engine,
     EngineOption,
+    FlipOption,
     JsonOption,
     LevelOption,
     PresetOption,
     QuietOption,
+    ScaleOption,
     SensorAtOption,
     SensorOption,
     SetOption,
@@ -27,6 +31,7 @@ from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.cli.track import TrackOptions, run_track
 from jaxbox.cli.track_ray import TrackRayOptions, run_track_ray
 from jaxbox.cli.track_results import TrackFormat
+from jaxbox.io import ORDINARY, PointConvention
 from jaxbox.io.poses import AUTO
 from jaxbox.run.pose_providers import ESTIMATED
 from jaxbox.run.tracking import MAX_TRACKS, RATE_HZ
@@ -132,6 +137,10 @@ def track(
     topic: TopicOption = None,
     sensor_at: SensorAtOption = None,
     level: LevelOption = False,
+    scale: ScaleOption = 1.0,
+    axes: AxesOption = "ros",
+    flip: FlipOption = "",
+    columns: ColumnsOption = None,
     capacity: CapacityOption = None,
     jobs: Annotated[
         int | None,
@@ -161,6 +170,7 @@ def track(
     with input_errors():
         if not rate_hz > 0:
             raise typer.BadParameter(f"--rate-hz is {rate_hz:g}; give sweeps a second, such as 10.")
+        convention = PointConvention(scale, axes, flip, columns)
         common: dict[str, Any] = {
             "config": chosen_config(preset, settings, changes or [], sensor=sensor),
             "track_config": chosen_track_config(track_changes or []),
@@ -184,7 +194,7 @@ def track(
                 output=output,
                 formats=frozenset(result_format or []),
                 points=points,
-                mounted=level or sensor_at is not None,
+                mounted=level or sensor_at is not None or convention != ORDINARY,
                 address=address,
                 jobs=jobs,
                 **common,
@@ -197,6 +207,7 @@ def track(
             points=True if points is None else points,
             sensor_at=sensor_at,
             level=level,
+            convention=convention,
             jobs=jobs or 1,
             **common,
         )

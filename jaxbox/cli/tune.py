@@ -17,7 +17,7 @@ from jaxbox.config import DetectorConfig
 from jaxbox.config.fields import PRESET_KEY, changed_fields
 from jaxbox.evaluation.copies import COPIES, Frame, read_frame
 from jaxbox.evaluation.objectives import OBJECTIVES
-from jaxbox.io import InputError, atomic_writer, open_sweeps, read_drives
+from jaxbox.io import InputError, PointConvention, atomic_writer, open_sweeps, read_drives
 from jaxbox.run.compiled import count_compilations
 from jaxbox.tuning import Axis, Bench, Trial
 
@@ -44,6 +44,8 @@ class TuneOptions:
     """Name in `OBJECTIVES`."""
     drives: pathlib.Path | None
     """File with the drive of each frame."""
+    convention: PointConvention
+    """How the numbers of the points are to be taken."""
     seed: int
     """Of the settings that are tried."""
 
@@ -127,7 +129,8 @@ def make_bench(labels: pathlib.Path, options: TuneOptions) -> Bench:
     Raises:
       InputError: where there are none, one cannot be read, or a frame has no drive.
     """
-    frames = [frame for sweep in open_sweeps(labels) if (frame := read_frame(sweep)) is not None]
+    sweeps = open_sweeps(labels, convention=options.convention)
+    frames = [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
     if not frames:
         raise InputError(
             f"{labels}: no sweep there has labels and a calibration; give a labelled KITTI folder."

@@ -31,6 +31,8 @@ class ViewOptions:
     """Where the sensor is in the frame of the points, m; None for the origin."""
     level: bool
     """Whether its tilt is measured, and the sweeps are seen upright."""
+    convention: io.PointConvention
+    """How the numbers of the points are to be taken."""
     capacity: int | None
     """Points a sweep is padded to, or None for what it needs."""
     min_score: float
@@ -58,7 +60,9 @@ def run_view(paths: Sequence[str], options: ViewOptions, console: Console) -> Ex
       ImportError: without the extra ``view``.
     """
     sweeps, mounting = seen_from_sensor(
-        io.open_sweeps(paths, topic=options.topic), sensor_at=options.sensor_at, level=options.level
+        io.open_sweeps(paths, topic=options.topic, convention=options.convention),
+        sensor_at=options.sensor_at,
+        level=options.level,
     )
     if options.level and mounting is not None:
         console.print(describe_mounting(mounting), markup=False)

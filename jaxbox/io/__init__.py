@@ -8,6 +8,7 @@ from jaxbox.io.argoverse2 import (
     read_feather,
 )
 from jaxbox.io.config import read_config, write_config
+from jaxbox.io.convention import AXES, ORDINARY, PointConvention
 from jaxbox.io.drives import read_drives
 from jaxbox.io.images import read_image
 from jaxbox.io.jsonl import detections_record, read_jsonl, tracks_record, write_jsonl
@@ -51,6 +52,8 @@ from jaxbox.io.sweeps import RECORDING_SUFFIXES, open_sweeps
 from jaxbox.io.text_points import read_text_points
 
 __all__ = [
+    "AXES",
+    "ORDINARY",
     "POINT_SUFFIXES",
     "RECORDING_SUFFIXES",
     "VEHICLE_TYPES",
@@ -58,6 +61,7 @@ __all__ = [
     "KittiObject",
     "LabelledBoxes",
     "LevelSweeps",
+    "PointConvention",
     "PoseFile",
     "PoseFrame",
     "RecordedSweeps",

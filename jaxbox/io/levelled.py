@@ -4,13 +4,12 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from typing import overload
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbox._files import InputError
 from jaxbox.geometry.mounting import Mounting, measure_mounting
 from jaxbox.io.points import Points, TimedPoints
-from jaxbox.io.sweep import Sweep
+from jaxbox.io.sweep import Sweep, seen_from_frame
 from jaxbox.types import Calibration
 
 NUM_MEASURED = 5
@@ -37,12 +36,7 @@ class LevelSweep(Sweep):
     def read_calibration(self) -> Calibration | None:
         """Reads the camera; as `Sweep.read_calibration`, seen from the level frame."""
         calibration = super().read_calibration()
-        if calibration is None:
-            return None
-        T_rect_level = np.asarray(calibration.T_rect_velo, np.float64) @ np.linalg.inv(
-            self.mounting.T_level_points
-        )
-        return dataclasses.replace(calibration, T_rect_velo=jnp.asarray(T_rect_level, jnp.float32))
+        return None if calibration is None else seen_from_frame(calibration, self.mounting.T_level_points)
 
 
 class LevelSweeps(Sequence[LevelSweep]):

@@ -4,6 +4,8 @@ A file, or a folder of ROS 2 whose storage is MCAP. `jaxbox.io.mcap_file` finds 
 decoded as in `jaxbox.io.rosbag`.
 """
 
+import collections
+import dataclasses
 import pathlib
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -20,7 +22,8 @@ from jaxbox.io.recordings import (
     RecordingFormat,
     choose_topic,
 )
-from jaxbox.io.rosbag import METADATA_NAME, MessageDecoder, decode_message
+from jaxbox.io.rosbag import METADATA_NAME, SCAN_TYPES, MessageDecoder, ScanDecoder, decode_message
+from jaxbox.io.velodyne import ANY_MODEL, VelodyneSensor, calibrated_sensor
 
 _SUFFIX = ".mcap"
 _ROS_ENCODINGS = ("cdr", "ros1")
@@ -40,19 +43,21 @@ def open_mcap(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
       InputError: where it is not such a file, or the topic has to be named.
       ImportError: without the extra ``mcap``.
     """
-    files, counts, others = _index(path)
-    chosen = choose_topic(path, topic, counts, sorted(others - counts.keys()))
+    files, topics = _index(path)
+    others = sorted(topics.others - topics.counts.keys())
+    chosen = choose_topic(path, topic, topics.counts, others, topics.packets)
+    sensor = calibrated_sensor(path) if chosen in topics.packets else ANY_MODEL
 
     def messages() -> Iterator[Message]:
         for file in files:
             with open_mcap_file(file) as reader:
                 for schema, channel, message in reader.iter_messages([chosen]):
-                    decoder = _decoder_of(schema, channel)
+                    decoder = _decoder_of(schema, channel, sensor)
                     if decoder is not None:
                         where = f"{file}, {chosen} at {message.log_time}"
                         yield message.log_time, decoder(message.data, where)
 
-    return RecordedSweeps(path, chosen, counts[chosen], messages)
+    return RecordedSweeps(path, chosen, topics.counts[chosen], messages)
 
 
 def read_mcap_poses(path: pathlib.Path) -> Iterator[PoseMessage]:
@@ -89,18 +94,35 @@ def _pose_topics(reader: McapFile) -> set[str] | None:
     return {c.topic for c in summary.channels.values() if names.get(c.schema_id) in POSE_TYPES}
 
 
-def _index(path: pathlib.Path) -> tuple[list[pathlib.Path], dict[str, int], set[str]]:
-    """The files of a recording in the order of time, messages by topic of points, and the other topics."""
-    counts: dict[str, int] = {}
-    others: set[str] = set()
+@dataclasses.dataclass(frozen=True)
+class _Topics:
+    """What a recording has, by topic."""
+
+    counts: collections.Counter[str] = dataclasses.field(default_factory=collections.Counter)
+    """Messages of points, or of a sensor's packets."""
+    packets: set[str] = dataclasses.field(default_factory=set)
+    """Those of packets."""
+    others: set[str] = dataclasses.field(default_factory=set)
+    """Topics with messages of other kinds."""
+
+    def add(self, schema: Any, channel: Any, number: int) -> None:
+        if _decoder_of(schema, channel) is None:
+            self.others.add(channel.topic)
+            return
+        self.counts[channel.topic] += number
+        if schema.name in SCAN_TYPES:
+            self.packets.add(channel.topic)
+
+
+def _index(path: pathlib.Path) -> tuple[list[pathlib.Path], _Topics]:
+    """The files of a recording in the order of time, and its topics."""
+    topics = _Topics()
     starts = {}
     for file in sorted(_storage_files(path)) if path.is_dir() else [path]:
         with open_mcap_file(file) as reader:
-            found, starts[file] = _count_messages(reader, others)
-        for name, count in found.items():
-            counts[name] = counts.get(name, 0) + count
+            starts[file] = _count_messages(reader, topics)
     # The names of a long recording's files are numbered, 10 before 2.
-    return sorted(starts, key=lambda file: starts[file]), counts, others
+    return sorted(starts, key=lambda file: starts[file]), topics
 
 
 def _storage_files(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -112,34 +134,32 @@ def is_mcap_folder(path: pathlib.Path) -> bool:
     return (path / METADATA_NAME).is_file() and bool(_storage_files(path))
 
 
-def _count_messages(reader: McapFile, others: set[str]) -> tuple[dict[str, int], int]:
-    """Messages by topic of points, and the first time, by the index or else one pass; adds other topics."""
-    counts: dict[str, int] = {}
+def _count_messages(reader: McapFile, topics: _Topics) -> int:
+    """Adds messages by topic, by the index or else one pass; answers the first time."""
     summary = reader.summary
     if summary is None or summary.statistics is None:
         start = 0
         for schema, channel, message in reader.iter_messages():
             start = min(start or message.log_time, message.log_time)
-            if _decoder_of(schema, channel) is None:
-                others.add(channel.topic)
-            else:
-                counts[channel.topic] = counts.get(channel.topic, 0) + 1
-        return counts, start
+            topics.add(schema, channel, 1)
+        return start
     for channel in summary.channels.values():
-        if _decoder_of(summary.schemas.get(channel.schema_id), channel) is None:
-            others.add(channel.topic)
-        else:
-            number = summary.statistics.channel_message_counts.get(channel.id, 0)
-            counts[channel.topic] = counts.get(channel.topic, 0) + number
-    return counts, summary.statistics.message_start_time
+        number = summary.statistics.channel_message_counts.get(channel.id, 0)
+        topics.add(summary.schemas.get(channel.schema_id), channel, number)
+    return summary.statistics.message_start_time
 
 
-def _decoder_of(schema: Any, channel: Any) -> Callable[[bytes, str], RecordedPoints] | None:
+def _decoder_of(
+    schema: Any, channel: Any, sensor: VelodyneSensor = ANY_MODEL
+) -> Callable[[bytes, str], RecordedPoints] | None:
     """What decodes the messages of a channel; None where they hold something else than points."""
     name = None if schema is None else schema.name
-    if name in MESSAGE_TYPES and channel.message_encoding in _ROS_ENCODINGS:
-        is_ros1 = channel.message_encoding == "ros1"
-        return lambda data, where: MessageDecoder(data, where, is_ros1)
+    is_ros1 = channel.message_encoding == "ros1"
+    if channel.message_encoding in _ROS_ENCODINGS:
+        if name in MESSAGE_TYPES:
+            return lambda data, where: MessageDecoder(data, where, is_ros1)
+        if name in SCAN_TYPES:
+            return lambda data, where: ScanDecoder(data, where, is_ros1, sensor)
     if name == POINT_CLOUD and channel.message_encoding == "protobuf":
         return PointCloudDecoder
     return None

@@ -10,6 +10,7 @@ from typing import Any, BinaryIO, Protocol
 import numpy as np
 
 from jaxbox._files import MAX_SWEEP_BYTES, InputError, atomic_path, read_bytes, reason
+from jaxbox.io.columns import told_columns
 
 _VALUES_PER_POINT = 4
 _BYTES_PER_POINT = _VALUES_PER_POINT * np.dtype("<f4").itemsize
@@ -228,29 +229,32 @@ def read_number_lines(file: BinaryIO, count: int, columns: int, where: str) -> n
     return rows
 
 
-def read_bin(path: str | os.PathLike[str]) -> Points:
+def read_bin(path: str | os.PathLike[str], *, columns: int | None = None) -> Points:
     """Reads KITTI's binary points: little-endian float32 x, y, z, intensity, and no header.
 
     Args:
       path: the file; an empty one is a sweep without points.
+      columns: values a point, 4 or more, of which the first four are used; None to tell 4, 5 and 6 by the
+        numbers themselves, see `jaxbox.io.columns`.
 
     Returns:
       xyz: (n, 3) float32, m, sensor frame.
       intensity: (n,) float32.
 
     Raises:
-      InputError: where the file is missing, or its size is not a multiple of 16 bytes.
+      InputError: where the file is missing, its size is no whole number of points, or the number of columns
+        is not clear.
     """
-    points = read_float_rows(path, _VALUES_PER_POINT, "x, y, z, intensity")
+    points = read_float_rows(path, columns, "x, y, z, intensity, ...")
     return points[:, :3], points[:, 3]
 
 
-def read_float_rows(path: str | os.PathLike[str], columns: int, names: str) -> np.ndarray:
+def read_float_rows(path: str | os.PathLike[str], columns: int | None, names: str) -> np.ndarray:
     """Reads rows of little-endian float32 without a header.
 
     Args:
       path: the file; an empty one has no rows.
-      columns: values a row.
+      columns: values a row; None to tell it by the numbers.
       names: of the columns, for the error.
 
     Returns:
@@ -260,12 +264,13 @@ def read_float_rows(path: str | os.PathLike[str], columns: int, names: str) -> n
       InputError: where the file is missing, or its size is not a whole number of rows.
     """
     data = read_bytes(path)
+    if columns is None:
+        columns = told_columns(data, path)
     row = columns * np.dtype("<f4").itemsize
     if len(data) % row:
         raise InputError(
             f"{path}: {len(data)} bytes is not a multiple of {row} (float32 {names}). "
-            f"Copy the file again if it was cut short, or convert it to {columns} columns; five columns, as "
-            "of nuScenes, are read from names that end in .pcd.bin."
+            f"Copy the file again if it was cut short, or convert it to {columns} columns."
         )
     return np.frombuffer(data, "<f4").astype(np.float32).reshape(-1, columns)
 

@@ -130,7 +130,8 @@ def find_poses(
         if isinstance(found, UnusableSource):
             told(f"Not used: {found}.")
             continue
-        T = orthonormal_pose(_levelled(found.T_world_sensor, listed.sweeps[0]))
+        first = listed.sweeps[0]
+        T = orthonormal_pose(_levelled(first.convention.world_poses(found.T_world_sensor), first))
         told(f"Poses: {found.source}, {found.origin}.")
         return dataclasses.replace(found, T_world_sensor=T)
     return None

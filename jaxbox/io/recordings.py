@@ -7,10 +7,11 @@ import dataclasses
 import difflib
 import itertools
 import pathlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, overload
 
 from jaxbox._files import InputError
+from jaxbox.io.convention import ORDINARY
 from jaxbox.io.points import RecordedPoints
 from jaxbox.io.sweep import Sweep
 
@@ -66,6 +67,8 @@ class RecordedSweeps(Sequence[Sweep]):
         """The recording."""
         self.topic = topic
         """The topic that the sweeps are from."""
+        self.convention = ORDINARY
+        """How the points of each are to be taken."""
         self._count = count
         self._messages = messages
 
@@ -77,7 +80,14 @@ class RecordedSweeps(Sequence[Sweep]):
         """One pass over the recording."""
         for index, (timestamp_ns, decode) in enumerate(self._messages()):
             name = f"{self.path.stem}_{index:06d}"
-            yield Sweep(name, self.path, timestamp_ns=timestamp_ns, sequence=self.path.stem, decode=decode)
+            yield Sweep(
+                name,
+                self.path,
+                timestamp_ns=timestamp_ns,
+                sequence=self.path.stem,
+                decode=decode,
+                convention=self.convention,
+            )
 
     @overload
     def __getitem__(self, index: int) -> Sweep: ...
@@ -96,7 +106,11 @@ class RecordedSweeps(Sequence[Sweep]):
 
 
 def choose_topic(
-    path: pathlib.Path, topic: str | None, counts: Mapping[str, int], others: Sequence[str]
+    path: pathlib.Path,
+    topic: str | None,
+    counts: Mapping[str, int],
+    others: Sequence[str],
+    packets: Collection[str] = (),
 ) -> str:
     """Picks the topic of points that is meant.
 
@@ -105,6 +119,8 @@ def choose_topic(
       topic: its name, or None for the only one.
       counts: number of messages of each topic of points.
       others: names of the other topics, for the error.
+      packets: those of `counts` that are a sensor's packets: None means one of them only where there is
+        nothing else, as a driver's points are likely of the same sensor.
 
     Returns:
       A name of `counts`.
@@ -115,10 +131,15 @@ def choose_topic(
     >>> choose_topic(pathlib.Path("a.bag"), None, {"/points": 3}, ["/imu"])
     '/points'
     """
+    if topic is None and (points := {name: n for name, n in counts.items() if name not in packets}):
+        counts = points
     listed = ", ".join(f"{name} ({count})" for name, count in sorted(counts.items()))
     if not counts:
         names = ", ".join(sorted(others)[:_MAX_NAMED]) or "none at all"
-        raise InputError(f"{path}: no topic of sensor_msgs/PointCloud2; its topics are {names}.")
+        raise InputError(
+            f"{path}: no topic of sensor_msgs/PointCloud2, or of velodyne_msgs/VelodyneScan; its topics are "
+            f"{names}."
+        )
     if topic is None and len(counts) > 1:
         raise InputError(f"{path}: several topics of points: {listed}; choose one with --topic (topic=...).")
     if topic is not None and topic not in counts:

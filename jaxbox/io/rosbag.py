@@ -27,11 +27,19 @@ from jaxbox.io.recordings import (
     RecordingFormat,
     choose_topic,
 )
+from jaxbox.io.velodyne import PACKET_BYTES, VelodynePoints, VelodyneSensor, calibrated_sensor
 
 METADATA_NAME = "metadata.yaml"
 """What a folder of ROS 2 holds besides its storage."""
 
-_TYPE = MESSAGE_TYPES[0]
+SCAN_TYPES = ("velodyne_msgs/msg/VelodyneScan", "velodyne_msgs/VelodyneScan")
+"""The packets of a turn, by the names of ROS 2 and ROS 1."""
+
+_TYPE, _SCAN = MESSAGE_TYPES[0], SCAN_TYPES[0]
+_SCAN_DEFINITIONS = {
+    "velodyne_msgs/msg/VelodynePacket": f"builtin_interfaces/Time stamp\nuint8[{PACKET_BYTES}] data",
+    _SCAN: "std_msgs/Header header\nvelodyne_msgs/VelodynePacket[] packets",
+}
 _DATABASE = ".db3"
 _MAX_METADATA_BYTES = 2**24
 _PACKED_MESSAGES = "message"
@@ -54,14 +62,23 @@ def open_rosbag(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps:
       ImportError: without the extra ``ros``.
     """
     with _reader(path) as reader:
-        counts = {name: info.msgcount for name, info in reader.topics.items() if info.msgtype == _TYPE}
-        chosen = choose_topic(path, topic, counts, [name for name in reader.topics if name not in counts])
+        topics = reader.topics.items()
+        counts = {name: info.msgcount for name, info in topics if info.msgtype in (_TYPE, _SCAN)}
+        scans = {name for name, info in topics if info.msgtype == _SCAN}
+        others = [name for name in reader.topics if name not in counts]
+        chosen = choose_topic(path, topic, counts, others, scans)
+    sensor = calibrated_sensor(path) if chosen in scans else None
 
     def messages() -> Iterator[Message]:
         with _reader(path) as reader:
-            connections = [c for c in reader.connections if c.topic == chosen and c.msgtype == _TYPE]
+            kind = _TYPE if sensor is None else _SCAN
+            connections = [c for c in reader.connections if c.topic == chosen and c.msgtype == kind]
             for _, timestamp_ns, data, where in _messages(reader, connections, path):
-                yield timestamp_ns, MessageDecoder(data, where, _is_ros1(path))
+                is_ros1 = _is_ros1(path)
+                if sensor is None:
+                    yield timestamp_ns, MessageDecoder(data, where, is_ros1)
+                else:
+                    yield timestamp_ns, ScanDecoder(data, where, is_ros1, sensor)
 
     return RecordedSweeps(path, chosen, counts[chosen], messages)
 
@@ -196,6 +213,36 @@ class MessageDecoder:
         return decode_message(self._data, _TYPE, self._where, is_ros1=self._is_ros1)
 
 
+class ScanDecoder:
+    """A serialised VelodyneScan, decoded when it is called."""
+
+    def __init__(self, data: bytes, where: str, is_ros1: bool, sensor: VelodyneSensor) -> None:
+        self._data, self._where, self._is_ros1, self._sensor = data, where, is_ros1, sensor
+
+    def __call__(self) -> Points:
+        """Decodes the points.
+
+        Raises:
+          InputError: naming recording, topic and time.
+          ImportError: without the extra ``ros`` or ``velodyne``.
+        """
+        return self._points()()
+
+    def timed(self) -> TimedPoints:
+        """Decodes the points, and when each was measured; raises as a call."""
+        return self._points().timed()
+
+    def header(self) -> tuple[int, str]:
+        """The header's time, ns since 1970 or 0, and the name of the points' frame; raises as a call."""
+        return self._points().header()
+
+    def _points(self) -> VelodynePoints:
+        message = decode_message(self._data, _SCAN, self._where, is_ros1=self._is_ros1)
+        packets = [(stamp_ns(packet.stamp), packet.data.tobytes()) for packet in message.packets]
+        header = (stamp_ns(message.header.stamp), message.header.frame_id)
+        return VelodynePoints(packets, self._sensor, self._where, header)
+
+
 def decode_message(data: bytes, name: str, where: str, *, is_ros1: bool) -> Any:
     """Decodes a message by the library's own definition.
 
@@ -229,6 +276,8 @@ def _typestore(is_ros1: bool) -> Any:
     if TF_MESSAGE not in store.types:
         # tf2_msgs is not among the library's definitions of ROS 1.
         store.register(typesys.get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF_MESSAGE))
+    for name, definition in _SCAN_DEFINITIONS.items():
+        store.register(typesys.get_types_from_msg(definition, name))
     return store
 
 

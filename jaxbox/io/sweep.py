@@ -4,14 +4,16 @@ import dataclasses
 import os
 import pathlib
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxbox._files import InputError
+from jaxbox.io.convention import ORDINARY, PointConvention
 from jaxbox.io.images import read_image, read_image_size
 from jaxbox.io.kitti import KittiObject, read_labels
 from jaxbox.io.kitti_calibration import IMAGE_SIZE_PX, read_calibration, read_raw_calibration
-from jaxbox.io.points import Points, RecordedPoints, TimedPoints
-from jaxbox.io.registry import read_points, read_timed_points
+from jaxbox.io.points import BIN, Points, RecordedPoints, TimedPoints, read_bin
+from jaxbox.io.registry import format_of, read_points, read_timed_points
 from jaxbox.types import Calibration
 
 _END_OF_TIME_NS = 2**63
@@ -42,6 +44,8 @@ class Sweep:
     recording's name, or the folder's; None where that is not known."""
     decode: RecordedPoints | None = dataclasses.field(default=None, repr=False, compare=False)
     """Decodes the points of a sweep within a recording; None where `points_path` holds this sweep alone."""
+    convention: PointConvention = ORDINARY
+    """How its numbers are to be taken; what is read of it is in metres, x forward, y left, z up."""
 
     def __post_init__(self) -> None:
         """Keeps what a file or index claims within what results can hold.
@@ -74,7 +78,15 @@ class Sweep:
           InputError: naming the file, where it cannot be read.
           ImportError: naming the extra that its format needs, where that is not installed.
         """
-        return read_points(self.points_path) if self.decode is None else self.decode()
+        xyz, intensity = self._source_points()
+        return self.convention.apply(xyz), intensity
+
+    def _source_points(self) -> Points:
+        if self.decode is not None:
+            return self.decode()
+        if self.convention.columns is not None and format_of(self.points_path) is BIN:
+            return read_bin(self.points_path, columns=self.convention.columns)
+        return read_points(self.points_path)
 
     def read_timed_points(self) -> TimedPoints:
         """Reads the points, and when each was measured.
@@ -87,7 +99,13 @@ class Sweep:
           InputError: naming the file, where it cannot be read, or the unit of the times is not clear.
           ImportError: naming the extra that its format needs, where that is not installed.
         """
-        return read_timed_points(self.points_path) if self.decode is None else self.decode.timed()
+        if self.decode is not None:
+            points = self.decode.timed()
+        elif format_of(self.points_path) is BIN:
+            points = TimedPoints(*self._source_points())
+        else:
+            points = read_timed_points(self.points_path)
+        return dataclasses.replace(points, xyz=self.convention.apply(points.xyz))
 
     def read_calibration(self) -> Calibration | None:
         """Reads the calibration of the left colour camera.
@@ -103,8 +121,12 @@ class Sweep:
             return None
         size = None if self.image_path is None else read_image_size(self.image_path)
         if self.calibration_path.is_dir():
-            return read_raw_calibration(self.calibration_path, image_size_px=size)
-        return read_calibration(self.calibration_path, image_size_px=size or IMAGE_SIZE_PX)
+            calibration = read_raw_calibration(self.calibration_path, image_size_px=size)
+        else:
+            calibration = read_calibration(self.calibration_path, image_size_px=size or IMAGE_SIZE_PX)
+        if self.convention == ORDINARY:
+            return calibration
+        return seen_from_frame(calibration, self.convention.T_points_source)
 
     def read_labels(self) -> list[KittiObject] | None:
         """Reads the labels of this sweep.
@@ -127,3 +149,17 @@ class Sweep:
           InputError: naming the file, where it cannot be decoded.
         """
         return None if self.image_path is None else read_image(self.image_path)
+
+
+def seen_from_frame(calibration: Calibration, T_frame_points: np.ndarray) -> Calibration:
+    """The same camera, for points in another frame.
+
+    Args:
+      calibration: for the points as they are.
+      T_frame_points: (4, 4) float64, m, from the points as they are to the frame.
+
+    Returns:
+      The calibration for the frame.
+    """
+    T = np.asarray(calibration.T_rect_velo, np.float64) @ np.linalg.inv(T_frame_points)
+    return dataclasses.replace(calibration, T_rect_velo=jnp.asarray(T, jnp.float32))

@@ -27,17 +27,20 @@ from collections.abc import Iterator, Sequence
 from typing import overload
 
 from jaxbox._files import InputError, check_file, read_text
+from jaxbox.io.convention import ORDINARY, PointConvention
 from jaxbox.io.kitti import tracking_name
 from jaxbox.io.kitti_calibration import RAW_CALIBRATION_FILES
 from jaxbox.io.mcap import MCAP
+from jaxbox.io.ouster import OSF
 from jaxbox.io.points import PointFormat
 from jaxbox.io.recordings import RecordedSweeps, RecordingFormat
 from jaxbox.io.registry import POINT_FORMATS, POINT_SUFFIXES, format_of, suffix_of
 from jaxbox.io.rosbag import ROSBAG
 from jaxbox.io.sweep import Sweep
 from jaxbox.io.text_points import TEXT
+from jaxbox.io.velodyne import CAPTURE
 
-RECORDING_FORMATS: tuple[RecordingFormat, ...] = (MCAP, ROSBAG)
+RECORDING_FORMATS: tuple[RecordingFormat, ...] = (MCAP, ROSBAG, CAPTURE, OSF)
 """The recordings that `open_sweeps` knows; a folder of ROS 2 whose storage is MCAP is read as MCAP."""
 
 RECORDING_SUFFIXES: tuple[str, ...] = tuple(
@@ -60,16 +63,20 @@ _IMAGE_SUFFIXES = (".png", ".jpg")
 PathLike = str | os.PathLike[str]
 
 
-def open_sweeps(path: PathLike | Sequence[PathLike], *, topic: str | None = None) -> Sequence[Sweep]:
+def open_sweeps(
+    path: PathLike | Sequence[PathLike], *, topic: str | None = None, convention: PointConvention = ORDINARY
+) -> Sequence[Sweep]:
     """Finds the sweeps at a path; see the module for the layouts.
 
     Nothing but folders, and the index of recordings, is read before it is asked for; a pass over a
     recording holds one message at a time.
 
     Args:
-      path: a point file, a recording (ROS bag, MCAP), a folder of either, a KITTI, Argoverse 2 or nuScenes
-        folder, a pattern such as ``"drive/*.pcd"``, or several of them.
-      topic: of the points in recordings; None where each has only one.
+      path: a point file, a recording (ROS bag, MCAP, a capture of packets), a folder of either, a KITTI,
+        Argoverse 2 or nuScenes folder, a pattern such as ``"drive/*.pcd"``, or several of them.
+      topic: of the points in recordings, in captures sender and port; None where each has only one.
+
+      convention: how the numbers are to be taken, where they are not metres with x forward, y left, z up.
 
     Returns:
       At least one sweep, files sorted by path, and recordings by time; their names differ.
@@ -82,9 +89,18 @@ def open_sweeps(path: PathLike | Sequence[PathLike], *, topic: str | None = None
     if not paths:
         raise InputError("no path was given; name at least one file or folder.")
     parts = [part for item in paths for found in _expand(item) for part in _open_path(found, topic)]
+    if convention != ORDINARY:
+        parts = [_taken_as(part, convention) for part in parts]
     if all(isinstance(part, tuple) for part in parts):
         return _distinct([sweep for part in parts for sweep in part])
     return parts[0] if len(parts) == 1 else ChainedSweeps(parts)
+
+
+def _taken_as(sweeps: Sequence[Sweep], convention: PointConvention) -> Sequence[Sweep]:
+    if isinstance(sweeps, RecordedSweeps):
+        sweeps.convention = convention
+        return sweeps
+    return tuple(dataclasses.replace(sweep, convention=convention) for sweep in sweeps)
 
 
 def sweep_of(file: pathlib.Path) -> Sweep:
