@@ -33,6 +33,7 @@ class MountedSource:
           report: is told how the sensor stands.
         """
         self.name, self.can_wait, self.hint = source.name, source.can_wait, source.hint
+        self.is_open = source.is_open
         self._source, self._convention = source, convention
         self._position, self._level, self._report = position, level, report
 

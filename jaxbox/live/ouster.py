@@ -13,7 +13,7 @@ from jaxbox.live.sweep import IDLE_S, Fault, LiveSweep, now_ns
 class OusterSource:
     """An Ouster sensor; a `jaxbox.live.Source`."""
 
-    can_wait = False
+    can_wait, is_open = False, False
 
     def __init__(self, host: str) -> None:
         """Connects, and has the sensor send its packets to this machine.
