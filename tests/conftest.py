@@ -24,11 +24,11 @@ FAST = {
     "test_hostile_files.py", "test_io_drives.py", "test_io_files.py", "test_io_formats.py",
     "test_io_kitti.py", "test_io_kitti_tracking.py", "test_io_other_sensors.py", "test_io_poses.py",
     "test_io_velodyne.py", "test_lidar_packets.py", "test_live.py", "test_live_libraries.py",
-    "test_output.py", "test_packaging.py", "test_paper_table.py", "test_point_convention.py",
-    "test_point_times.py", "test_reference.py", "test_reliability_benchmarks.py",
-    "test_sensors_benchmark.py", "test_speed_benchmarks.py", "test_synthetic.py", "test_tracking_poses.py",
-    "test_tuning.py", "test_types.py", "test_viz.py", "test_viz_judged.py", "test_viz_tracks.py",
-    "test_xla_laws.py",
+    "test_live_packets.py", "test_output.py", "test_packaging.py", "test_paper_table.py",
+    "test_point_convention.py", "test_point_times.py", "test_reference.py",
+    "test_reliability_benchmarks.py", "test_sensors_benchmark.py", "test_speed_benchmarks.py",
+    "test_synthetic.py", "test_tracking_poses.py", "test_tuning.py", "test_types.py", "test_viz.py",
+    "test_viz_judged.py", "test_viz_tracks.py", "test_xla_laws.py",
 }  # fmt: skip
 """Files whose tests make up ``pytest -m fast``, but for the tests in `SLOW`."""
 SLOW = {

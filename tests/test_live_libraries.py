@@ -159,6 +159,7 @@ class Frame:
 
     fields = ("RANGE", "REFLECTIVITY")
     timestamp = np.array([0, 2_000_000_000, 2_050_000_000], np.uint64)
+    packet_timestamp = np.array([7_000_000_000, 7_050_000_000], np.uint64)
 
     def field(self, name):
         return np.array([[0, 5, 0], [0, 6, 7]]) * (1000 if name == "RANGE" else 1)
@@ -170,7 +171,7 @@ def sensors(monkeypatch):
     found = types.SimpleNamespace(frames=[], closed=False, hosts=[])
 
     class SensorFrameSetSource:
-        sensor_info = ("metadata",)
+        sensor_info = (types.SimpleNamespace(to_json_string=lambda: "{}"),)
 
         def __init__(self, host):
             if host == "nobody":
@@ -186,9 +187,11 @@ def sensors(monkeypatch):
         def close(self):
             found.closed = True
 
-    lut = types.SimpleNamespace(XYZLut=lambda info, use_extrinsics: lambda frame: np.ones((2, 3, 3)))
+    core = types.SimpleNamespace(
+        SensorInfo=lambda text: text, XYZLut=lambda info, use_extrinsics: lambda ranges: np.ones((2, 3, 3))
+    )
     sensor = types.SimpleNamespace(SensorFrameSetSource=SensorFrameSetSource, ClientTimeout=ClientTimeout)
-    for name, module in {"ouster.sdk.sensor": sensor, "ouster.sdk.core": lut}.items():
+    for name, module in {"ouster.sdk.sensor": sensor, "ouster.sdk.core": core}.items():
         monkeypatch.setitem(sys.modules, name, module)
     return found
 
@@ -200,9 +203,10 @@ def test_a_frame_is_a_sweep_of_what_its_beams_saw(sensors):
     assert sensors.hosts == ["os-1.local"]
     assert none is nothing is None
     assert isinstance(item, LiveSweep)
-    assert item.timestamp_ns == 2_000_000_000
+    assert item.timestamp_ns == 7_050_000_000
     assert item.points.intensity.tolist() == [5, 6, 7]
-    np.testing.assert_allclose(item.points.time_s, [0, 0, 0.05])
+    assert item.points.xyz.tolist() == [[1, 1, 1]] * 3
+    np.testing.assert_allclose(item.points.time_s, [-0.05, -0.05, 0])
 
 
 def test_a_sensor_that_does_not_answer_is_named(sensors):

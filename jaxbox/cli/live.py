@@ -12,7 +12,7 @@ from rich.text import Text
 
 from jaxbox import io
 from jaxbox._interrupts import heard, stoppable
-from jaxbox.cli.console import ExitCode, exit_code, printable, stderr, stdout
+from jaxbox.cli.console import ExitCode, exit_code, print_warning, printable, stderr, stdout
 from jaxbox.cli.inputs import print_json
 from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
 from jaxbox.cli.report import SHOWN_MIN_SCORE
@@ -27,6 +27,7 @@ from jaxbox.live.records import LiveRecords
 from jaxbox.live.ros2 import open_ros2
 from jaxbox.live.sinks import Sink
 from jaxbox.live.sources import is_sensor, open_sensor
+from jaxbox.viewer.server import LOOPBACK_NAMES
 
 STATUS_S = 0.25
 """How often the status line is drawn, s."""
@@ -42,6 +43,8 @@ class LiveOptions:
     """Settings of detector, poses and tracker."""
     topic: str | None
     """Topic of the points in recordings."""
+    convention: io.PointConvention
+    """How the numbers of the points are to be taken."""
     rate_hz: float
     """Sweeps a second of recordings without times."""
     loop: bool
@@ -141,8 +144,11 @@ def run_live(source: str, options: LiveOptions) -> ExitCode:
       InputError: where the source or an address cannot be opened, or a recording breaks off.
       ImportError: without an extra that is needed.
     """
+    opened = _open(source, options)
+    if not options.quiet:
+        _warn_of_others(opened, options)
     run = LiveRun(
-        _open(source, options),
+        opened,
         options.config,
         capacity=options.capacity,
         timeout_s=options.timeout_s,
@@ -171,6 +177,17 @@ def run_live(source: str, options: LiveOptions) -> ExitCode:
     return exit_code(failed=run.num_faults > 0, interrupted=interrupted)
 
 
+def _warn_of_others(source: Source, options: LiveOptions) -> None:
+    """Says who else can send, and who can see."""
+    if source.is_open:
+        print_warning(f"whoever reaches {source.name} can send points; ?from=ADDRESS names the sensor.")
+    if options.host not in LOOPBACK_NAMES and (options.foxglove_port, options.page_port) != (None, None):
+        print_warning(
+            f"at {options.host} everybody who can reach this machine sees the sweeps; docs/viewer.md tells "
+            "how to forward a port instead."
+        )
+
+
 def _tell(sentence: str) -> None:
     stderr().print(sentence, markup=False)
 
@@ -185,11 +202,13 @@ def _open(source: str, options: LiveOptions) -> Source:
     position = options.sensor_at or (0.0, 0.0, 0.0)
     if is_sensor(source):
         sensor = open_sensor(source)
-        if not options.level and not any(position):
-            return sensor
-        return MountedSource(sensor, position=position, level=options.level, report=tell)
+        return MountedSource(
+            sensor, position=position, level=options.level, convention=options.convention, report=tell
+        )
     sweeps, mounting = seen_from_sensor(
-        io.open_sweeps(source, topic=options.topic), sensor_at=options.sensor_at, level=options.level
+        io.open_sweeps(source, topic=options.topic, convention=options.convention),
+        sensor_at=options.sensor_at,
+        level=options.level,
     )
     if mounting is not None:
         tell(mounting)

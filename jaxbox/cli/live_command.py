@@ -8,16 +8,20 @@ from jaxbox.cli.config_options import chosen_config, chosen_track_config, comple
 from jaxbox.cli.console import input_errors
 from jaxbox.cli.live import LiveOptions, run_live
 from jaxbox.cli.options import (
+    AxesOption,
+    ColumnsOption,
+    FlipOption,
     LevelOption,
     PresetOption,
     QuietOption,
+    ScaleOption,
     SensorAtOption,
     SensorOption,
     SetOption,
     SettingsOption,
     TopicOption,
 )
-from jaxbox.io import InputError
+from jaxbox.io import InputError, PointConvention
 from jaxbox.live import LiveConfig
 from jaxbox.live.foxglove import PORT as FOXGLOVE_PORT
 from jaxbox.live.loop import TIMEOUT_S
@@ -112,6 +116,10 @@ def live(
     topic: TopicOption = None,
     sensor_at: SensorAtOption = None,
     level: LevelOption = False,
+    scale: ScaleOption = 1.0,
+    axes: AxesOption = "ros",
+    flip: FlipOption = "",
+    columns: ColumnsOption = None,
     capacity: Annotated[
         int | None,
         typer.Option(
@@ -142,6 +150,7 @@ def live(
         options = LiveOptions(
             config=config,
             topic=topic,
+            convention=PointConvention(scale, axes, flip, columns),
             rate_hz=rate_hz,
             loop=loop,
             sensor_at=sensor_at,

@@ -1,7 +1,9 @@
-"""A sensor that is tilted, or not at the origin: its sweeps in the level frame of its mounting."""
+"""A sensor with other axes, tilted, or not at the origin: its sweeps in the level frame of its mounting."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
+
+import numpy as np
 
 from jaxbox import io
 from jaxbox.geometry.mounting import Mounting
@@ -18,6 +20,7 @@ class MountedSource:
         *,
         position: tuple[float, float, float],
         level: bool,
+        convention: io.PointConvention = io.ORDINARY,
         report: Callable[[Mounting], None],
     ) -> None:
         """Takes a source.
@@ -26,10 +29,13 @@ class MountedSource:
           source: of the sweeps as they are.
           position: x, y, z of the sensor in the frame of the points, m.
           level: whether the tilt is measured on the first sweeps, which are not handed on.
+          convention: unit and axes of the points.
           report: is told how the sensor stands.
         """
         self.name, self.can_wait, self.hint = source.name, source.can_wait, source.hint
-        self._source, self._position, self._level, self._report = source, position, level, report
+        self.is_open = source.is_open
+        self._source, self._convention = source, convention
+        self._position, self._level, self._report = position, level, report
 
     def __iter__(self) -> Iterator[LiveSweep | Fault | None]:
         """The sweeps in the level frame.
@@ -39,15 +45,21 @@ class MountedSource:
         """
         mounting = None if self._level else Mounting(self._position)
         first: list[LiveSweep] = []
-        for item in self._source:
-            if not isinstance(item, LiveSweep):
-                yield item
-            elif mounting is None:
+        for came in self._source:
+            if not isinstance(came, LiveSweep):
+                yield came
+                continue
+            item = _moved(came, self._convention.apply)
+            if mounting is None:
                 first.append(item)
                 if len(first) == NUM_MEASURED:
                     # It asks a sweep for no more than its name and points.
                     mounting = io.measure_sweeps(first, position=self._position)  # pyright: ignore[reportArgumentType]
                     self._report(mounting)
             else:
-                points = dataclasses.replace(item.points, xyz=mounting.level(item.points.xyz))
-                yield dataclasses.replace(item, points=points)
+                yield _moved(item, mounting.level)
+
+
+def _moved(sweep: LiveSweep, move: Callable[[np.ndarray], np.ndarray]) -> LiveSweep:
+    points = dataclasses.replace(sweep.points, xyz=move(sweep.points.xyz))
+    return dataclasses.replace(sweep, points=points)

@@ -17,7 +17,7 @@ _NS_PER_S = 10**9
 class RecordedSource:
     """The sweeps of a recording at their own pace; a `jaxbox.live.Source`."""
 
-    can_wait = True
+    can_wait, is_open = True, False
     hint = "the recording pauses there."
 
     def __init__(

@@ -63,7 +63,7 @@ def _node(name: str) -> Any:
 class Ros2Source:
     """The clouds of a ROS 2 topic; a `jaxbox.live.Source`."""
 
-    can_wait = False
+    can_wait, is_open = False, False
 
     def __init__(self, topic: str) -> None:
         """Subscribes.

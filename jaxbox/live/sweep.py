@@ -68,6 +68,8 @@ class Source(Protocol):
     """Whether it holds its sweeps back while nobody is ready, as a recording does and a sensor does not."""
     hint: str
     """What to look at where nothing comes."""
+    is_open: bool
+    """Whether whoever reaches this machine may send points."""
 
     def __iter__(self) -> Iterator[LiveSweep | Fault | None]:
         """The sweeps as they come; None several times a second while there is none."""

@@ -21,6 +21,7 @@ from jaxbox._extras import require
 from jaxbox._files import read_text, reason
 from jaxbox.io import InputError, TimedPoints
 from jaxbox.live.sweep import IDLE_S, Fault, LiveSweep, now_ns
+from jaxbox.viewer.server import LOOPBACK_NAMES
 
 PORT = 2368
 """To which Velodyne sensors send unless they are told otherwise."""
@@ -55,6 +56,11 @@ class UdpAddress:
     calibration: pathlib.Path | None = None
     """Calibration of the lasers, YAML; None for the model's own."""
 
+    @property
+    def is_open(self) -> bool:
+        """Whether others than this machine and a named sensor may send."""
+        return self.sender is None and self.host not in LOOPBACK_NAMES
+
 
 class VelodyneSource:
     """A Velodyne sensor whose packets come in at a port; a `jaxbox.live.Source`."""
@@ -72,6 +78,8 @@ class VelodyneSource:
           ImportError: without the extra ``velodyne``.
         """
         self._library = require("velodyne_decoder", extra="velodyne", what="Velodyne packets")
+        self.is_open = address.is_open
+        """Whether whoever reaches the port may send."""
         self._address = address
         self._decoder = _Decoder(self._library, _config_of(self._library, address))
         self._socket = _listening(address)
