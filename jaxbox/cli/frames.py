@@ -212,6 +212,7 @@ def _judge(read: _Read, detections: Detections, min_score: float) -> _Shown:
 def _draw_tile(read: _Read, detections: Detections, shown: _Shown, min_score: float) -> np.ndarray:
     """The sweep from above, under the camera's image where there is one, at the width of a tile."""
     xyz = np.asarray(read.points[0], np.float64)
+    xyz = xyz[np.isfinite(xyz).all(axis=1)]
     boxes = BoxSet.from_detections(detections, min_score=min_score)
     common = {"boxes": boxes, "truth": shown.truth, "judged": shown.judged, "legend": False}
     colors = color_by_height(height_above_plane(xyz, detections))
