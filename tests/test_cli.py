@@ -24,6 +24,7 @@ from jaxbox.cli.report import (
     describe_frame,
     describe_run,
 )
+from jaxbox.cli.run_sheet import TILE_FRAME
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation.report import read_folders
 from jaxbox.io import (
@@ -115,6 +116,18 @@ def test_crops_are_the_points_in_the_boxes_in_the_order_of_the_results(kitti_fol
     for name, mask in inside.items():
         for cropped, points in zip(crops[name], (xyz, intensity), strict=True):
             np.testing.assert_array_equal(cropped, points[mask])
+
+
+def test_no_sweep_fails_for_want_of_a_tile_of_the_contact_sheet(kitti_folder, tmp_path):
+    root = tmp_path / "training"
+    shutil.copytree(kitti_folder, root)
+    (root / "label_2" / "000000.txt").write_text("rubbish\n")
+    result = run("detect", root, "--output", tmp_path / "out", "--no-pictures")
+    assert result.exit_code == 0, result.output
+    assert "2 sweeps done, 0 failed" in result.stdout
+    height, width, _ = read_image(tmp_path / "out" / "contact_sheet.png").shape
+    assert width < 2 * TILE_FRAME.width_px, "the tile of the other sweep"
+    assert height > TILE_FRAME.shape[0]
 
 
 def test_both_formats_hold_the_same_boxes(detected):

@@ -8,6 +8,7 @@ import pytest
 from kitti_objects import car
 
 from jaxbox import evaluation
+from jaxbox.cli.evaluate import clip_sentence
 from jaxbox.evaluation import matching, report
 from jaxbox.geometry import planar
 from jaxbox.io import (
@@ -340,6 +341,21 @@ def test_recall_is_of_boxes_that_the_image_cuts_off_where_the_run_tells(folder, 
     assert measure(first, second | {"boxes": []}) == (False, (2, 3), (0, 1))
     with pytest.raises(InputError, match=r"detections\.jsonl: 000001 is no record"):
         measure(first, second | {"boxes": [{}]})
+
+
+@pytest.mark.parametrize(
+    ("num", "unclipped", "words"),
+    [
+        (0, True, ""),
+        (3, False, "`detect --format both` tell"),
+        (3, True, "Recall is of the boxes of detections"),
+    ],
+)
+def test_the_command_says_what_recall_is_of(num, unclipped, words):
+    cut_off = {"rates": [{"num_labels": num}]}
+    sentence = clip_sentence({"unclipped": unclipped, "selections": {"cut_off": cut_off}})
+    assert sentence.startswith(f"{num} labels are cut off") == (num > 0)
+    assert words in sentence
 
 
 def test_results_may_lie_in_a_data_folder(folder, tmp_path):
