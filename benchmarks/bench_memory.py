@@ -59,7 +59,7 @@ def watch_run(preset: str, frames: int) -> dict[str, Any]:
         link_sweeps(sweeps, frames)
         command = [
             *(sys.executable, "-m", "jaxbox", "detect", str(sweeps), "--output", str(output)),
-            *("--preset", preset, "--no-pictures", "--format", "jsonl"),
+            *("--preset", preset, "--no-pictures", "--no-contact-sheet", "--format", "jsonl"),
         ]
         progress = pathlib.Path(root, "progress.txt")
         samples = []

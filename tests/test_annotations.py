@@ -189,6 +189,10 @@ def test_a_sweep_without_labels_is_a_sweep_without_a_camera(tmp_path):
     assert [sweep.is_annotated for sweep in sweeps] == [True, False, True]
     assert sweeps[1].read_labels() is None
     assert sweeps[1].read_calibration() is None
+    write(open_cvat, tmp_path / "b", names=NAMES[:2])
+    points = tmp_path / "b" / "pointclouds"
+    (points / f"{NAMES[1]}.pcd").rename(points / "other.pcd")
+    assert [sweep.read_labels() is None for sweep in io.open_sweeps(tmp_path / "b")] == [False, True]
 
 
 def test_labels_all_round_are_evaluated_in_space_alone(tmp_path):

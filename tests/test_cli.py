@@ -24,6 +24,7 @@ from jaxbox.cli.report import (
     describe_frame,
     describe_run,
 )
+from jaxbox.cli.run_sheet import TILE_FRAME
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation.report import read_folders
 from jaxbox.io import (
@@ -115,6 +116,18 @@ def test_crops_are_the_points_in_the_boxes_in_the_order_of_the_results(kitti_fol
     for name, mask in inside.items():
         for cropped, points in zip(crops[name], (xyz, intensity), strict=True):
             np.testing.assert_array_equal(cropped, points[mask])
+
+
+def test_no_sweep_fails_for_want_of_a_tile_of_the_contact_sheet(kitti_folder, tmp_path):
+    root = tmp_path / "training"
+    shutil.copytree(kitti_folder, root)
+    (root / "label_2" / "000000.txt").write_text("rubbish\n")
+    result = run("detect", root, "--output", tmp_path / "out", "--no-pictures")
+    assert result.exit_code == 0, result.output
+    assert "2 sweeps done, 0 failed" in result.stdout
+    height, width, _ = read_image(tmp_path / "out" / "contact_sheet.png").shape
+    assert width < 2 * TILE_FRAME.width_px, "the tile of the other sweep"
+    assert height > TILE_FRAME.shape[0]
 
 
 def test_both_formats_hold_the_same_boxes(detected):
@@ -212,7 +225,7 @@ def test_eval_pictures_with_a_broken_image_end_with_exit_code_2_and_its_file(
     (root / "image_2").mkdir()
     (root / "image_2" / "000001.png").write_bytes(b"no image")
     results = tmp_path / "results"
-    shutil.copytree(detected[0], results, ignore=shutil.ignore_patterns("pictures"))
+    shutil.copytree(detected[0], results, ignore=shutil.ignore_patterns("pictures", "*.png"))
     result = run("eval", "--labels", root, "--results", results, "--pictures")
     assert result.exit_code == 2
     assert "image_2/000001.png: not a readable image" in result.stderr
@@ -322,7 +335,8 @@ def test_one_broken_sweep_is_reported_and_the_others_are_done(kitti_folder, tmp_
     assert "000000.bin" in result.stderr
     assert "16" in result.stderr
     assert "1 sweeps done, 1 failed" in result.stdout
-    assert sorted(path.name for path in output.iterdir()) == ["000001.txt", "config.toml", "run.json"]
+    names = ["000001.txt", "config.toml", "contact_sheet.png", "run.json"]
+    assert sorted(path.name for path in output.iterdir()) == names
     account = json.loads((output / "run.json").read_text())
     assert (account["num_done"], account["failures"][0]["sweep"]) == (1, "000000")
 
@@ -359,7 +373,7 @@ def test_sweeps_without_a_camera_are_written_as_json_lines(tmp_path):
     result = run("detect", tmp_path / "sweeps", "--output", output, "--no-pictures", "--min-score", "0.01")
     assert result.exit_code == 0, result.output
     assert "no camera calibration" in result.stderr
-    names = ["config.toml", "detections.jsonl", "run.json"]
+    names = ["config.toml", "contact_sheet.png", "detections.jsonl", "run.json"]
     assert sorted(path.name for path in output.iterdir()) == names
     records = read_jsonl(output / "detections.jsonl")
     scores = [box["score"] for record in records for box in record["boxes"]]
@@ -458,7 +472,26 @@ def test_demo_writes_a_picture_a_stage_and_compares_every_vehicle(tmp_path, monk
     stages = ("sweep", "no_ground", "clusters", "hulls", "boxes", "lidar", "image")
     assert names == [f"{number}_{stage}.png" for number, stage in enumerate(stages, start=1)]
     rows = [line for line in result.stdout.splitlines() if " m " in line and "│" in line]
-    assert len(rows) == demo.NUM_VEHICLES
+    false = [row for row in rows if "false alarm at" in row]
+    assert len(rows) - len(false) == demo.NUM_VEHICLES
+
+
+def test_the_demo_tells_false_alarms_as_its_pictures_do():
+    sweep = make_small_sweep(3)
+    truth = sweep.boxes
+    # Another box on the first vehicle, and one where there is none.
+    rows = [0, 0, *range(1, len(truth)), 0]
+    center = truth.center[rows].astype(float)
+    center[-1, :2] = (30, 40)
+    captions = tuple(f"box {row}" for row in range(len(rows)))
+    boxes = demo.BoxSet(center=center, size=truth.size[rows], yaw=truth.yaw[rows], captions=captions)
+    known, judged = demo.known_truth(boxes, sweep)
+    false = demo.false_alarms(boxes, known, judged)
+    assert np.flatnonzero(false).tolist() == [1, len(rows) - 1]
+    table = demo.compare_with_truth(boxes, sweep, false)
+    cells = {column.header: list(column.cells) for column in table.columns}
+    assert cells["vehicle"][-1] == "false alarm at 50 m"
+    assert cells["box"][-2:] == ["box 1", captions[-1]]
 
 
 def test_the_picture_of_the_documentation_is_of_this_detector(tmp_path):
@@ -478,7 +511,7 @@ def test_a_table_of_perfect_boxes_has_no_errors():
     boxes = demo.BoxSet(
         center=truth.center, size=truth.size, yaw=truth.yaw, captions=tuple("x" for _ in range(len(truth)))
     )
-    table = demo.compare_with_truth(boxes, sweep)
+    table = demo.compare_with_truth(boxes, sweep, np.zeros(len(truth), bool))
     cells = {column.header: list(column.cells) for column in table.columns}
     assert set(cells["length"]) == {"+0.00"}
     assert set(cells["yaw"]) == {"+0.0"}

@@ -10,10 +10,11 @@ from typer.testing import CliRunner
 import jaxbox
 from jaxbox import synthetic
 from jaxbox.cli import app
+from jaxbox.cli.tune import time_left
 from jaxbox.io import objects_from_detections, read_config, write_bin, write_calibration, write_labels
 from jaxbox.run import cache
 from jaxbox.run.compiled import count_compilations
-from jaxbox.tuning import Bench
+from jaxbox.tuning import Bench, Trial
 from jaxbox.types import PointCloud
 
 NUM_SWEEPS = 3
@@ -60,6 +61,15 @@ def tune(kitti_folder, output, *arguments):
 
 def read_report(output):
     return json.loads((output / "report.json").read_text())
+
+
+def test_the_time_left_is_that_of_the_median_trial():
+    done = [
+        Trial(index=row, changes={}, blind=True, matches=(), scores=(), scores_without={}, seconds=seconds)
+        for row, seconds in enumerate((90.0, 4.0, 6.0))
+    ]
+    assert time_left(done, 3 + 60) == "0:06:00"
+    assert time_left(done, 3) == "0:00:00"
 
 
 def test_a_wrong_base_is_told_from_a_better_setting_on_drives_left_out(kitti_folder, drives, tmp_path):

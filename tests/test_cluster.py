@@ -683,6 +683,7 @@ def test_what_the_workers_cannot_do_for_drives_is_refused(drives, tmp_path):
         (("--engine", "ray", "--format", "kitti"), "write parquet"),
         (("--engine", "ray", "--pictures"), "--pictures: the workers"),
         (("--engine", "ray", "--video"), "--video: the workers"),
+        (("--engine", "ray", "--gif"), "--gif: the workers of --engine ray have no such option"),
         (("--engine", "ray", "--no-points"), "holds no points"),
         (("--engine", "ray", "--coasting"), "--coasting: it is for KITTI text"),
         (("--engine", "ray", "--level"), "takes sweeps as they are"),

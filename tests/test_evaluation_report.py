@@ -8,9 +8,20 @@ import pytest
 from kitti_objects import car
 
 from jaxbox import evaluation
+from jaxbox.cli.evaluate import clip_sentence
 from jaxbox.evaluation import matching, report
 from jaxbox.geometry import planar
-from jaxbox.io import InputError, KittiObject, open_sweeps, write_bin, write_labels
+from jaxbox.io import (
+    InputError,
+    KittiObject,
+    boxes_from_objects,
+    objects_from_boxes,
+    open_sweeps,
+    write_bin,
+    write_jsonl,
+    write_labels,
+)
+from jaxbox.io.kitti import MIN_VISIBLE_FRACTION, boxes_in_image
 
 ALL = matching.Selection()
 
@@ -295,6 +306,56 @@ def test_a_folder_is_measured_with_points_counted_in_the_sweeps(folder, tmp_path
     assert everything["objects"]["num_points"] == [3]
     assert everything["objects"]["range_m"] == pytest.approx([20])
     assert measured["selections"]["clear"]["rates"][0]["num_labels"] == 0
+
+
+def test_recall_is_of_boxes_that_the_image_cuts_off_where_the_run_tells(folder, tmp_path):
+    """A car at the left edge of the image: found, and left out of KITTI's text."""
+    calibration = open_sweeps(folder)[0].read_calibration()
+    size = np.array([[3.9, 1.6, 1.5]])
+    centers = np.array([[4.0, y, -1.0] for y in np.arange(3, 9, 0.1)])
+    num = len(centers)
+    _, fraction, visible = boxes_in_image(centers, np.tile(size, (num, 1)), np.zeros(num), calibration)
+    (place, *_) = centers[visible & (fraction < MIN_VISIBLE_FRACTION)]
+    (label,) = objects_from_boxes(
+        place[None], size, np.zeros(1), calibration, types=["Car"], min_visible_fraction=0
+    )
+    write_labels(folder / "label_2" / "000000.txt", [label, car()])
+    near = boxes_from_objects([car()], calibration, keep_heading=True)
+    shown = {"center": near[0][0].tolist(), "size": near[1][0].tolist(), "heading": float(near[2][0])}
+    cut = {"center": place.tolist(), "size": size[0].tolist(), "heading": 0.0}
+    boxes = [{"label": "car", "score": 0.9, **shown}, {"label": "car", "score": 0.4, **cut}]
+    for name in ("000000", "000001"):
+        write_labels(tmp_path / "out" / f"{name}.txt", [car(score=0.9)])
+
+    def measure(*records):
+        write_jsonl(tmp_path / "out" / "detections.jsonl", records)
+        measured = evaluation.evaluate_folders(folder, tmp_path / "out")
+        rates = {name: part["rates"][0] for name, part in measured["selections"].items()}
+        found = {name: (rate["num_found"], rate["num_labels"]) for name, rate in rates.items()}
+        return measured["unclipped"], found["all"], found["cut_off"]
+
+    first, second = {"name": "000000", "boxes": boxes}, {"name": "000001", "boxes": boxes[:1]}
+    assert measure(first, second) == (True, (3, 3), (1, 1))
+    # Those of another run are not taken: they lack a sweep, or a box of the text.
+    assert measure(first) == (False, (2, 3), (0, 1))
+    assert measure(first, second | {"boxes": []}) == (False, (2, 3), (0, 1))
+    with pytest.raises(InputError, match=r"detections\.jsonl: 000001 is no record"):
+        measure(first, second | {"boxes": [{}]})
+
+
+@pytest.mark.parametrize(
+    ("num", "unclipped", "words"),
+    [
+        (0, True, ""),
+        (3, False, "`detect --format both` tell"),
+        (3, True, "Recall is of the boxes of detections"),
+    ],
+)
+def test_the_command_says_what_recall_is_of(num, unclipped, words):
+    cut_off = {"rates": [{"num_labels": num}]}
+    sentence = clip_sentence({"unclipped": unclipped, "selections": {"cut_off": cut_off}})
+    assert sentence.startswith(f"{num} labels are cut off") == (num > 0)
+    assert words in sentence
 
 
 def test_results_may_lie_in_a_data_folder(folder, tmp_path):

@@ -12,7 +12,7 @@ from jaxbox.config import DetectorConfig
 from jaxbox.synthetic import SyntheticSweep, make_sweep
 from jaxbox.types import Label, PointCloud
 from jaxbox.viz import BoxSet, draw_stages, save_png
-from jaxbox.viz.boxes import bird_eye_iou
+from jaxbox.viz.boxes import bird_eye_iou, find_matches
 
 MIN_TRUTH_POINTS = 10
 """Vehicles with fewer points can hardly be found: they count neither as missed nor as false alarms."""
@@ -42,8 +42,8 @@ def run_demo(output: pathlib.Path, *, seed: int, console: Console) -> None:
     for line in describe_frame(report):
         console.print(line)
     boxes = BoxSet.from_detections(detections, min_score=SHOWN_MIN_SCORE)
-    console.print(compare_with_truth(boxes, sweep))
     truth, judged = known_truth(boxes, sweep)
+    console.print(compare_with_truth(boxes, sweep, false_alarms(boxes, truth, judged)))
     pictures = draw_stages(
         cloud,
         detections,
@@ -77,8 +77,26 @@ def _truth_boxes(sweep: SyntheticSweep, rows: np.ndarray) -> BoxSet:
     return BoxSet(center=truth.center[rows], size=truth.size[rows], yaw=truth.yaw[rows])
 
 
-def compare_with_truth(boxes: BoxSet, sweep: SyntheticSweep) -> Table:
-    """One row a vehicle, nearest first: what was found of it, and how far it is from the truth."""
+def false_alarms(boxes: BoxSet, truth: BoxSet, judged: np.ndarray) -> np.ndarray:
+    """(K,) bool: the estimates that the pictures show as false alarms.
+
+    Args:
+      boxes: K estimates.
+      truth: as `known_truth` returns it.
+      judged: likewise, (K,) bool.
+    """
+    hit, _ = find_matches(boxes, truth)
+    return ~hit & judged
+
+
+def compare_with_truth(boxes: BoxSet, sweep: SyntheticSweep, false: np.ndarray) -> Table:
+    """One row a vehicle, nearest first: what was found of it, and how far it is from the truth.
+
+    Args:
+      boxes: K estimates.
+      sweep: with its truth.
+      false: (K,) bool: estimates on no vehicle, which have rows at the end.
+    """
     truth = sweep.boxes
     distance = np.linalg.norm(truth.center[:, :2], axis=1)
     every = np.ones(len(truth), bool)
@@ -97,6 +115,9 @@ def compare_with_truth(boxes: BoxSet, sweep: SyntheticSweep) -> Table:
         else:
             few = truth.num_points[row] < MIN_TRUTH_POINTS
             rows.append([*known, "too few points" if few else "missed", "", "", "", "", ""])
+    for row in np.flatnonzero(false):
+        place = f"false alarm at {np.hypot(*boxes.center[row, :2]):.0f} m"
+        rows.append([place, "", "", boxes.captions[row], "", "", "", "", ""])
     columns = ("vehicle", "points", "in sight", "box", "length", "width", "height", "yaw", "BEV IoU")
     return make_table("boxes against the truth (estimated - true, m and degrees)", columns, rows)
 

@@ -15,8 +15,10 @@ from jaxbox.cli.eval_pictures import write_judged_pictures
 from jaxbox.cli.report import make_table
 from jaxbox.evaluation import evaluate_folders
 from jaxbox.evaluation.kitti import VEHICLE_OVERLAP
+from jaxbox.evaluation.matching import MAX_TRUNCATION
 from jaxbox.evaluation.report import read_folders
 from jaxbox.io import atomic_writer, open_sweeps, read_drives
+from jaxbox.io.kitti import MIN_VISIBLE_FRACTION
 
 SELECTION_NAMES = {
     "all": "every labelled car",
@@ -24,6 +26,7 @@ SELECTION_NAMES = {
     "easy_to_moderate": "KITTI's easy and moderate",
     "clear": "at least 30 points, occlusion 0 or 1",
     "dense": "at least 50 points",
+    "cut_off": f"cut off by the image: truncation above {MAX_TRUNCATION:g}",
 }
 PLOTS_FOLDER, PICTURES_FOLDER = "plots", "pictures"
 """Where in the results' folder the plots go, unless said otherwise, and the pictures."""
@@ -96,6 +99,8 @@ def print_report(report: Mapping[str, Any], console: Console) -> None:
     taken = report.get("num_missing_results", 0)
     console.print(f"{report['num_frames']} labelled sweeps" + f", {taken} without results" * bool(taken))
     console.print(recall_table(report["selections"]))
+    if sentence := clip_sentence(report):
+        console.print(sentence)
     everything = report["selections"]["all"]
     console.print(score_table(everything["rates_by_score"]))
     console.print(bin_table("range, m", everything["by_range"]))
@@ -122,6 +127,21 @@ def recall_table(selections: Mapping[str, Any]) -> Table:
     some = next(iter(selections.values()))["rates"]
     columns = ["cars", "labels", *(f"{rate['metric'].upper()} {rate['min_overlap']:g}" for rate in some)]
     return make_table("recall of all boxes, whatever their score", columns, rows)
+
+
+def clip_sentence(report: Mapping[str, Any]) -> str:
+    """What recall says of labels that the image cuts off; empty where it cuts off none."""
+    num_cut = report["selections"]["cut_off"]["rates"][0]["num_labels"]
+    if not num_cut:
+        return ""
+    sentence = f"{num_cut} labels are cut off by the image; KITTI's difficulties leave them out. "
+    left_out = f"of which KITTI's text leaves out those with less than {MIN_VISIBLE_FRACTION:g} in the image"
+    if report["unclipped"]:
+        return f"{sentence}Recall is of the boxes of detections.jsonl, {left_out}."
+    return (
+        f"{sentence}Some may be found and not written: recall is of boxes, {left_out}. "
+        "Results of `detect --format both` tell."
+    )
 
 
 def score_table(rates_by_score: Iterable[Mapping[str, Any]]) -> Table:

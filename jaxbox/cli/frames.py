@@ -1,6 +1,7 @@
 """What `jaxbox detect` does for each sweep before its results are written: here, or in worker processes."""
 
 import concurrent.futures
+import contextlib
 import dataclasses
 import pathlib
 import time
@@ -168,10 +169,13 @@ class FrameWork:
         name, min_score = read.sweep.name, self.shown_min_score
         if self.crop_folder is not None:
             write_crops(self.crop_folder, name, read.points, enumerate(detections), min_score=min_score)
-        if self.picture_folder is None and name not in self.tiles:
-            return None
-        shown = _judge(read, detections, min_score)
+        tile = None
+        if name in self.tiles:
+            # No sweep fails for want of a picture that nobody asked for.
+            with contextlib.suppress(io.InputError, OSError):
+                tile = _draw_tile(read, detections, _judge(read, detections, min_score), min_score)
         if self.picture_folder is not None:
+            shown = _judge(read, detections, min_score)
             pictures = draw_stages(
                 cloud,
                 detections,
@@ -184,7 +188,7 @@ class FrameWork:
             for kind in SHOWN_PICTURES:
                 if kind in pictures:
                     save_png(self.picture_folder / f"{name}_{kind}.png", pictures[kind])
-        return _draw_tile(read, detections, shown, min_score) if name in self.tiles else None
+        return tile
 
 
 @dataclasses.dataclass(frozen=True)
@@ -212,6 +216,7 @@ def _judge(read: _Read, detections: Detections, min_score: float) -> _Shown:
 def _draw_tile(read: _Read, detections: Detections, shown: _Shown, min_score: float) -> np.ndarray:
     """The sweep from above, under the camera's image where there is one, at the width of a tile."""
     xyz = np.asarray(read.points[0], np.float64)
+    xyz = xyz[np.isfinite(xyz).all(axis=1)]
     boxes = BoxSet.from_detections(detections, min_score=min_score)
     common = {"boxes": boxes, "truth": shown.truth, "judged": shown.judged, "legend": False}
     colors = color_by_height(height_above_plane(xyz, detections))

@@ -1,5 +1,6 @@
 """``jaxbox track``: drives to vehicles that have a history, one sequence after the other."""
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -290,12 +291,18 @@ class _Drive:
             xyz=xyz,
             intensity=intensity,
             calibration=kept.sweep.read_calibration(),
-            image=kept.sweep.read_image() if self._wants_image(kept.name) else None,
+            image=self._read_image(kept.sweep),
             trails=trails,
         )
 
-    def _wants_image(self, name: str) -> bool:
-        return self._files.wants_image or name in self._sheet.names
+    def _read_image(self, sweep: io.Sweep) -> np.ndarray | None:
+        if self._files.wants_image:
+            return sweep.read_image()
+        if sweep.name in self._sheet.names:
+            # No sweep is lost for want of a picture that nobody asked for.
+            with contextlib.suppress(io.InputError, OSError):
+                return sweep.read_image()
+        return None
 
     def _write_crops(self, tracked: TrackedSweep, result: SweepResult) -> None:
         if self._options.crops:

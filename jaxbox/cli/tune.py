@@ -2,8 +2,10 @@
 
 import csv
 import dataclasses
+import datetime
 import json
 import pathlib
+import statistics
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -83,7 +85,7 @@ def run_tune(labels: pathlib.Path, options: TuneOptions, console: Console) -> Ex
                 best = tuning.best_trial(trials)
                 console.print(
                     f"trial {trial.index} of {options.trials - 1}: {trial.mean:.2f}, {trial.seconds:.1f} s; "
-                    f"best {best.mean:.2f}, trial {best.index}"
+                    f"best {best.mean:.2f}, trial {best.index}; {time_left(trials, options.trials)} left"
                 )
         except KeyboardInterrupt:
             heard()
@@ -103,6 +105,20 @@ def run_tune(labels: pathlib.Path, options: TuneOptions, console: Console) -> Ex
     }
     write_report(report, options, console)
     return exit_code(failed=False, interrupted=interrupted)
+
+
+def time_left(trials: Sequence[Trial], planned: int) -> str:
+    """How long the other trials take, if each takes as long as the median one did.
+
+    Args:
+      trials: those that are done, at least one.
+      planned: how many there will be.
+
+    Returns:
+      Hours, minutes and seconds, such as "0:04:30".
+    """
+    seconds = statistics.median(trial.seconds for trial in trials) * (planned - len(trials))
+    return str(datetime.timedelta(seconds=round(seconds)))
 
 
 def chosen_axes(options: TuneOptions) -> list[Axis]:

@@ -30,6 +30,9 @@ RANGE_EDGES_M = (0.0, 10.0, 20.0, 30.0, 40.0, 50.0)
 POINT_EDGES = (0, 10, 30, 100, 300, 1000)
 """Lower edges of the bins of recall; the last bin has no upper one."""
 
+MAX_TRUNCATION = 0.5
+"""KITTI's difficulties leave out labels of which more is outside the image."""
+
 _MIN_HEIGHT_PX = kitti.MIN_HEIGHT_PX[-1]
 _EXCUSED_FRACTION = 0.5
 
@@ -46,6 +49,9 @@ class Selection:
     """KITTI's occlusion that a label may have: 0 visible, 1 partly, 2 largely occluded, 3 unknown."""
     difficulty: str | None = None
     """KITTI's limits that a label must keep: "easy", "moderate", "hard", or None for none."""
+    cut_off: bool | None = None
+    """Only labels that the image cuts off, of a truncation above `MAX_TRUNCATION`, or only others; None is
+    both."""
     track_id: int | None = None
     """Only this object of a tracking sequence, or None for every one."""
 
@@ -147,7 +153,8 @@ def _label_role(label: KittiObject, selection: Selection) -> int:
         return _OTHER
     if label.occlusion > selection.max_occlusion:
         return _IGNORED
-    if selection.track_id is not None and label.track_id != selection.track_id:
+    is_cut_off = label.truncation > MAX_TRUNCATION
+    if selection.cut_off not in (None, is_cut_off) or selection.track_id not in (None, label.track_id):
         return _IGNORED
     if selection.difficulty is None:
         return _COUNTS

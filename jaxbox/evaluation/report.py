@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from jaxbox.evaluation import kitti, matching, sizes
+from jaxbox.evaluation.unclipped import read_unclipped
 from jaxbox.io import InputError, KittiObject, Sweep, boxes_from_objects, open_sweeps, read_labels
 
 SELECTIONS: Mapping[str, matching.Selection] = {
@@ -17,9 +18,10 @@ SELECTIONS: Mapping[str, matching.Selection] = {
     "easy_to_moderate": matching.Selection(difficulty="moderate"),
     "clear": matching.Selection(min_points=30, max_occlusion=1),
     "dense": matching.Selection(min_points=50),
+    "cut_off": matching.Selection(cut_off=True),
 }
-"""Cars: every label; those of KITTI's difficulties; those that a sweep shows well; and those of that many
-points that no box should have its length and width changed places."""
+"""Cars: every label; those of KITTI's difficulties; those that a sweep shows well; those of that many points
+that no box should have its length and width changed places; and those that the image cuts off."""
 
 MATCH_OVERLAP = 0.2
 """Bird's-eye IoU from which sizes and directions are compared. A median car with its axes swapped still has
@@ -43,6 +45,9 @@ class LabelledResults:
     """Detections of each."""
     num_missing: int
     """Result files that were missing and taken for empty."""
+    unclipped: kitti.Objects | None = None
+    """Detections of each with those that KITTI's text leaves out, see `jaxbox.evaluation.unclipped`; None
+    where they are not known."""
 
 
 def read_folders(
@@ -75,10 +80,14 @@ def read_folders(
         raise InputError(f"{root}: no sweep there has labels; expected label_2 or label_02 next to velodyne.")
     labels = {sweep.name: objects for sweep, objects in labelled}
     detections = _read_results(pathlib.Path(results), list(labels), missing_as_empty=missing_as_empty)
+    found = {name: objects or [] for name, objects in detections.items()}
+    sweeps = tuple(sweep for sweep, _ in labelled)
+    has_cameras = all(sweep.calibration_path is not None for sweep in sweeps)
     return LabelledResults(
-        sweeps=tuple(sweep for sweep, _ in labelled),
+        sweeps=sweeps,
         labels=labels,
-        results={name: found or [] for name, found in detections.items()},
+        results=found,
+        unclipped=read_unclipped(results, sweeps, found) if has_cameras else None,
         num_missing=sum(found is None for found in detections.values()),
     )
 
@@ -105,7 +114,8 @@ def evaluate_folders(
       missing_as_empty: take a missing result file for an empty one.
 
     Returns:
-      As `evaluate_objects`, and under "num_missing_results" how many files were taken for empty.
+      As `evaluate_objects`, and under "num_missing_results" how many files were taken for empty. Recall is of
+      all boxes, also those that KITTI's text leaves out, where ``detections.jsonl`` of the run has them.
 
     Raises:
       InputError: as `read_folders`.
@@ -121,6 +131,7 @@ def evaluate_folders(
         selections=selections,
         match_overlap=match_overlap,
         drives=drives,
+        unclipped=read.unclipped,
         metrics=kitti.METRICS_IN_SPACE if any(sweep.is_annotated for sweep in read.sweeps) else kitti.METRICS,
     )
     return report | {"num_missing_results": read.num_missing}
@@ -206,6 +217,7 @@ def evaluate_objects(
     match_overlap: float = MATCH_OVERLAP,
     drives: Mapping[str, str] | None = None,
     metrics: Sequence[str] = kitti.METRICS,
+    unclipped: kitti.Objects | None = None,
 ) -> dict[str, Any]:
     """Measures results against labels.
 
@@ -218,9 +230,11 @@ def evaluate_objects(
       match_overlap: bird's-eye IoU from which sizes and directions are compared.
       drives: the drive of each frame, to report each by itself too.
       metrics: as `kitti.evaluate`.
+      unclipped: as `measure_selection`.
 
     Returns:
       Numbers, strings, lists, dicts and None only:
+        "unclipped": whether recall is of those;
         "num_frames", "num_drives" (None if unknown);
         "kitti": `KittiEvaluation.to_dict` of cars and of the other classes that have detections;
         "vehicles": the curves of cars, vans, trucks and trams as one class, see `kitti.as_vehicles`;
@@ -235,6 +249,7 @@ def evaluate_objects(
     protocol = kitti.evaluate(labels, results, min_overlap=classes, metrics=metrics, drives=drives)
     usable = {n: s for n, s in selections.items() if num_points is not None or s.min_points <= 0}
     return {
+        "unclipped": unclipped is not None,
         "num_frames": len(labels),
         "num_drives": None if drives is None else len({drives[name] for name in labels}),
         "kitti": protocol.to_dict(),
@@ -242,7 +257,12 @@ def evaluate_objects(
         "soft": kitti.soft_score(labels, results),
         "selections": {
             name: measure_selection(
-                labels, results, selection, num_points=num_points, match_overlap=match_overlap
+                labels,
+                results,
+                selection,
+                num_points=num_points,
+                match_overlap=match_overlap,
+                unclipped=unclipped,
             )
             for name, selection in usable.items()
         },
@@ -263,6 +283,7 @@ def measure_selection(
     *,
     num_points: Mapping[str, np.ndarray] | None = None,
     match_overlap: float = MATCH_OVERLAP,
+    unclipped: kitti.Objects | None = None,
 ) -> dict[str, Any]:
     """Measures what was found of the selected labels, and how well its boxes fit.
 
@@ -272,6 +293,8 @@ def measure_selection(
       selection: what counts.
       num_points: as `evaluate_objects`.
       match_overlap: bird's-eye IoU from which sizes and directions are compared.
+      unclipped: detections with those that KITTI's text leaves out, as the image shows too little of them,
+        for "rates", "by_range" and "by_points"; None takes the results.
 
     Returns:
       Numbers, strings, lists, dicts and None only:
@@ -289,16 +312,19 @@ def measure_selection(
     """
     scenes = matching.select(labels, results, selection, num_points=num_points)
     matches = matching.matched_boxes(scenes, min_overlap=match_overlap)
+    whole = (
+        scenes if unclipped is None else matching.select(labels, unclipped, selection, num_points=num_points)
+    )
     return {
         "selection": selection.to_dict(),
         "rates": [
-            matching.rates(scenes, metric=metric, min_overlap=overlap).to_dict()
+            matching.rates(whole, metric=metric, min_overlap=overlap).to_dict()
             for metric in ("bev", "3d")
             for overlap in matching.RATE_OVERLAPS
         ],
         "rates_by_score": [_rates_at(scenes, min_score) for min_score in SCORE_CUTS],
-        "by_range": [row.to_dict() for row in matching.recall_by_range(scenes)],
-        "by_points": [row.to_dict() for row in matching.recall_by_points(scenes)],
+        "by_range": [row.to_dict() for row in matching.recall_by_range(whole)],
+        "by_points": [row.to_dict() for row in matching.recall_by_points(whole)],
         "matched": _matched_errors(matches, selection.class_name, match_overlap),
         "objects": _object_rows(matches),
     }
