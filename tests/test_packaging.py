@@ -3,11 +3,13 @@
 import importlib.metadata
 import json
 import pathlib
+import re
 import subprocess
 import sys
 import tomllib
 
 import pytest
+import yaml
 
 import jaxbox
 
@@ -71,3 +73,23 @@ def test_every_extra_is_in_the_documentation():
     table = (PROJECT / "docs" / "install.md").read_text()
     missing = [name for name in extras if f"| `{name}` |" not in table]
     assert not missing, "add them to the table in docs/install.md"
+
+
+CONDA_NAMES = {"flatbuffers": "python-flatbuffers", "opencv-python-headless": "py-opencv"}
+"""Of conda-forge, where they differ from PyPI's."""
+
+
+def test_the_conda_recipe_says_what_the_project_says():
+    project = tomllib.loads((PROJECT / "pyproject.toml").read_text())
+    about, recipe = project["project"], yaml.safe_load((PROJECT / "recipe" / "recipe.yaml").read_text())
+    needed = [re.fullmatch(r"([\w-]+)(.*)", text).groups() for text in about["dependencies"]]
+    wanted = {f"{CONDA_NAMES.get(name, name)} {bound}" for name, bound in needed}
+    assert set(recipe["requirements"]["run"]) == {"python >=${{ python_min }}", *wanted}
+    assert f">={recipe['context']['python_min']}" == about["requires-python"]
+    assert recipe["context"]["version"] == jaxbox.__version__
+    assert recipe["about"]["license"] == about["license"]
+    assert recipe["about"]["summary"] == about["description"]
+    built_with = [text.replace(" ", "") for text in recipe["requirements"]["host"]]
+    assert set(project["build-system"]["requires"]) <= set(built_with)
+    commands = recipe["build"]["python"]["entry_points"]
+    assert commands == [f"{name} = {target}" for name, target in about["scripts"].items()]

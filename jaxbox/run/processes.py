@@ -157,7 +157,12 @@ class ProcessPool(Generic[Item, Result]):
 
 
 def _keep_interrupts_away() -> None:
-    """Keeps Ctrl-C, which a terminal sends to all, from this thread's processes: the parent ends them."""
+    """Keeps Ctrl-C, which a terminal sends to all, from this thread's processes: the parent ends them.
+
+    Windows cannot, and its processes hear it.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        return
     # It lets the signal through again where it starts, which the first process would make it do.
     resource_tracker.ensure_running()
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
