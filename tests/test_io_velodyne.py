@@ -14,7 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from jaxbox import io
 from jaxbox.io.captures import read_datagrams
-from jaxbox.io.velodyne import ANY_MODEL, decode_packets
+from jaxbox.io.velodyne import ANY_MODEL, TurnBatcher, decode_packets
 
 SENSOR = packets.HDL32E
 TURNS = 3
@@ -412,6 +412,13 @@ def test_a_calibration_of_another_sensor_is_refused(tmp_path):
     (tmp_path / "drive.yaml").write_text(packets.hdl64e_calibration())
     with pytest.raises(io.InputError, match=r"a sensor of 32 lasers, and the calibration beside .* is of 64"):
         io.open_sweeps(tmp_path / "drive.pcap")[0].read_points()
+
+
+def test_a_sensor_that_does_not_turn_fills_no_memory():
+    batcher = TurnBatcher()
+    for _ in range(25_000):
+        assert batcher.push(0, SENT[0][1]) is None
+    assert sum(len(value) for value in vars(batcher).values() if isinstance(value, list)) <= 10_000
 
 
 def test_damaged_packets_are_an_input_error():

@@ -32,6 +32,8 @@ _FIRST_BLOCK = slice(2, 4)
 _FULL_TURN = 36000
 _MAX_TURN_NS = 300_000_000
 """The slowest turn takes 0.2 s; what is further apart is not of one."""
+_MAX_TURN_PACKETS = 10_000
+"""An Alpha Prime that sends two returns needs 2600 for its slowest turn."""
 _FACTORY_BYTES = slice(-2, None)
 _NUM_LOOKED_AT = 5
 _MAX_STATUS_PACKETS = 20_000
@@ -102,6 +104,7 @@ class TurnBatcher:
             self._cut = first
         reached = (last - self._cut) % _FULL_TURN
         late = bool(self._packets) and time_ns - self._packets[0][0] > _MAX_TURN_NS
+        late |= len(self._packets) >= _MAX_TURN_PACKETS
         done = self.finish() if late or reached < self._reached else None
         if not self._packets:
             self._began = reached - (last - first) % _FULL_TURN
