@@ -62,8 +62,8 @@ def test_killed_and_resumed_a_run_ends_as_if_nothing_had_happened(tmp_path, faul
     report = faults.kill_and_resume(tmp_path / "sweeps", tmp_path, kills=3, seed=1)
     assert report["kills"] == 3
     assert (report["differing"], report["half_written"], report["final_exit_code"]) == ([], [], 0)
-    # Settings, JSON Lines and Parquet; a text and two pictures a sweep.
-    assert report["files"] == 3 + 2 * 3
+    # Settings, JSON Lines, Parquet and the contact sheet; a text and two pictures a sweep.
+    assert report["files"] == 4 + 2 * 3
 
 
 WRITE_AND_DIE = """

@@ -9,12 +9,13 @@ import pytest
 
 from jaxbox import io
 from jaxbox.cli.box_filter import BoxFilter
-from jaxbox.cli.run_sheet import NUM_TILES, SHEET_NAME, RunSheet
+from jaxbox.cli.run_sheet import NUM_COLUMNS, NUM_TILES, SHEET_NAME, RunSheet
 from jaxbox.io import InputError
 from jaxbox.io.csv_table import CSV, open_csv
 from jaxbox.io.parquet import TRACK_COLUMNS
 from jaxbox.io.results import SweepResult
-from jaxbox.viz import open_gif, open_video, video
+from jaxbox.viz import open_gif, open_video, save_png, video
+from jaxbox.viz.contact_sheet import HEADER_PX
 
 BOX = {
     "label": "car", "score": 0.5, "center": [1.0, 2.0, 3.0], "size": [4.0, 2.0, 1.5], "yaw": 0.1,
@@ -85,17 +86,26 @@ def test_pcd_is_read_back_bit_by_bit(tmp_path, num_points):
 @pytest.mark.parametrize("num_sweeps", [0, 1, 5, NUM_TILES, 1000])
 def test_a_contact_sheet_has_few_sweeps_from_all_over_the_run(tmp_path, num_sweeps):
     names = [f"{number:04d}" for number in range(num_sweeps)]
-    sheet = RunSheet(tmp_path, [types.SimpleNamespace(name=name) for name in names], shown=True)
-    assert len(sheet.names) == min(num_sweeps, NUM_TILES)
+    sweeps = [types.SimpleNamespace(name=name) for name in names]
+    sheet = RunSheet(tmp_path, sweeps, shown=True)
+    assert len(sheet.tiles) == min(num_sweeps, NUM_TILES)
     if num_sweeps:
-        chosen = sorted(map(int, sheet.names))
+        chosen = list(map(int, sheet.tiles))
         assert (chosen[0], chosen[-1]) == (0, num_sweeps - 1)
         assert np.ptp(np.diff(chosen)) <= 1 if len(chosen) > 1 else True
-    for name in names:
-        sheet.add(np.full((30, 40, 3), 200, np.uint8) if name in sheet.names else None)
-    sheet.write(min_score=0.2)
-    assert (tmp_path / SHEET_NAME).exists() == (num_sweeps > 0)
-    assert RunSheet(tmp_path, [], shown=False).names == frozenset()
+    for row, path in enumerate(sheet.tiles.values()):
+        save_png(path, np.full((30, 40, 3), row, np.uint8))
+        sheet.write(min_score=0.2, is_complete=False)
+    # What resumes the run has the pictures of the run before.
+    RunSheet(tmp_path, sweeps, shown=True).write(min_score=0.2, is_complete=True)
+    names = [SHEET_NAME] if num_sweeps else []
+    assert [path.name for path in tmp_path.iterdir()] == names
+    assert RunSheet(tmp_path, sweeps, shown=False).tiles == {}
+    if num_sweeps:
+        sheet = io.read_image(tmp_path / SHEET_NAME)
+        places = [divmod(row, NUM_COLUMNS) for row in range(len(chosen))]
+        middles = [sheet[HEADER_PX + y * 36 + 20, 6 + x * 46 + 20, 0] for y, x in places]
+        assert middles == list(range(len(chosen)))
 
 
 def read_film(path):

@@ -1,8 +1,9 @@
 """``jaxbox detect``: sweeps of files, folders and recordings to result files and pictures, one by one."""
 
 import dataclasses
+import pathlib
 import time
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 from rich.progress import Progress
 
@@ -70,12 +71,13 @@ def run_detect(
         points=options.points,
     ) as results:
         account.write(finished=False)
-        _run_sweeps(sweeps, options, run, results, sheet)
+        _run_sweeps(sweeps, options, run, results, sheet.tiles)
+    is_complete = not (run.interrupted or run.failures)
     with written(options.output / SHEET_NAME):
-        sheet.write(min_score=options.shown_min_score)
+        sheet.write(min_score=options.shown_min_score, is_complete=is_complete)
     run.elapsed_s = time.perf_counter() - start
     account.write(
-        finished=not (run.interrupted or run.failures),
+        finished=is_complete,
         interrupted=run.interrupted,
         num_done=len(run.frames),
         num_skipped=run.num_skipped,
@@ -87,16 +89,20 @@ def run_detect(
 
 
 def _run_sweeps(
-    sweeps: Sequence[io.Sweep], options: DetectOptions, run: RunReport, results: Results, sheet: RunSheet
+    sweeps: Sequence[io.Sweep],
+    options: DetectOptions,
+    run: RunReport,
+    results: Results,
+    tiles: Mapping[str, pathlib.Path],
 ) -> None:
     """Every sweep; ends early, with what is done, where it is interrupted or a recording breaks off."""
     with stoppable(), make_progress(shown=options.speaks) as progress:
         task = progress.add_task("detecting", total=len(sweeps))
         missing = _missing(sweeps, results, run, progress)
-        frames = _frames(missing, options, run, results, sheet.names)
+        frames = _frames(missing, options, run, results, tiles)
         try:
             for sweep, wait in frames:
-                _run_frame(sweep, wait, options, run, results, sheet)
+                _run_frame(sweep, wait, options, run, results)
                 progress.advance(task)
         except io.InputError as error:
             run.failures.append(("the recording", str(error)))
@@ -126,7 +132,7 @@ def _frames(
     options: DetectOptions,
     run: RunReport,
     results: Results,
-    tiles: frozenset[str],
+    tiles: Mapping[str, pathlib.Path],
 ) -> FrameSource:
     """The frames of the sweeps, made here or by that many processes."""
     work = FrameWork(
@@ -174,13 +180,10 @@ def _run_frame(
     options: DetectOptions,
     run: RunReport,
     results: Results,
-    sheet: RunSheet,
 ) -> None:
     """One sweep, its files and its lines; a failure is added to the run."""
     try:
-        frame = wait()
-        sheet.add(frame.tile)
-        report = _write(sweep, frame, options, run, results)
+        report = _write(sweep, wait(), options, run, results)
     except (io.InputError, OSError, WorkerDied) as error:
         run.failures.append((sweep.name, str(error)))
         print_error(f"sweep {sweep.name}: {error}")

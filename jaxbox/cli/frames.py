@@ -5,7 +5,7 @@ import contextlib
 import dataclasses
 import pathlib
 import time
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping
 
 import numpy as np
 
@@ -51,8 +51,6 @@ class Frame:
     """Seconds of reading and drawing."""
     compile_s: dict[int, float]
     """Seconds that each capacity took to compile, in the process that did this sweep."""
-    tile: np.ndarray | None
-    """(h, w, 3) uint8 for the contact sheet, red green blue; None where it is not wanted."""
     picture_error: Exception | None
     """Why pictures or crops could not be made; None where they could, or were not wanted."""
 
@@ -86,8 +84,8 @@ class FrameWork:
     """Where pictures go; None for none."""
     crop_folder: pathlib.Path | None
     """Where the points in each box go; None for nowhere."""
-    tiles: frozenset[str]
-    """Names of the sweeps that are drawn for the contact sheet."""
+    tiles: Mapping[str, pathlib.Path]
+    """Where pictures for the contact sheet go, by the names of the sweeps that are on it."""
     shown_min_score: float
     """Boxes that score less are neither drawn nor cropped."""
     keep_points: bool
@@ -145,9 +143,9 @@ class FrameWork:
         detections, detect_s = detector(cloud)
         start = time.perf_counter()
         detections = self.keep(detections.on_host())
-        tile, picture_error = None, None
+        picture_error = None
         try:
-            tile = self._draw(read, cloud, detections)
+            self._draw(read, cloud, detections)
         except (io.InputError, OSError) as error:
             # The results do not depend on whether they can be drawn.
             picture_error = error
@@ -160,20 +158,19 @@ class FrameWork:
             detect_s=detect_s,
             other_s=read.seconds + padding_s + time.perf_counter() - start,
             compile_s=dict(detector.compile_s),
-            tile=tile,
             picture_error=picture_error,
         )
 
-    def _draw(self, read: _Read, cloud: PointCloud, detections: Detections) -> np.ndarray | None:
-        """Writes crops and pictures, and returns the tile, where they are wanted."""
+    def _draw(self, read: _Read, cloud: PointCloud, detections: Detections) -> None:
+        """Writes crops and pictures where they are wanted."""
         name, min_score = read.sweep.name, self.shown_min_score
         if self.crop_folder is not None:
             write_crops(self.crop_folder, name, read.points, enumerate(detections), min_score=min_score)
-        tile = None
         if name in self.tiles:
             # No sweep fails for want of a picture that nobody asked for.
             with contextlib.suppress(io.InputError, OSError):
-                tile = _draw_tile(read, detections, _judge(read, detections, min_score), min_score)
+                shown = _judge(read, detections, min_score)
+                save_png(self.tiles[name], _draw_tile(read, detections, shown, min_score))
         if self.picture_folder is not None:
             shown = _judge(read, detections, min_score)
             pictures = draw_stages(
@@ -188,7 +185,6 @@ class FrameWork:
             for kind in SHOWN_PICTURES:
                 if kind in pictures:
                     save_png(self.picture_folder / f"{name}_{kind}.png", pictures[kind])
-        return tile
 
 
 @dataclasses.dataclass(frozen=True)

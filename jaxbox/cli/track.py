@@ -35,7 +35,7 @@ from jaxbox.run.pose_providers import without_points
 from jaxbox.run.tracking import TrackedSweep, smooth_tracks, track
 from jaxbox.tracking.poses import Poses, PoseSource
 from jaxbox.tracking.trails import Trails
-from jaxbox.viz import BirdEyeFrame, draw_drive
+from jaxbox.viz import BirdEyeFrame, draw_drive, save_png
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -130,7 +130,7 @@ def run_track(paths: Sequence[str], options: TrackOptions) -> ExitCode:
             if report.interrupted:
                 break
     with written(options.output / SHEET_NAME):
-        sheet.write(min_score=options.shown_min_score)
+        sheet.write(min_score=options.shown_min_score, is_complete=not pending)
     _describe_run(run, options, time.perf_counter() - start)
     return exit_code(failed=bool(run.failures), interrupted=run.interrupted)
 
@@ -235,7 +235,7 @@ class _Drive:
         )
 
     def _wants_points(self, name: str) -> bool:
-        return self._files.wants_points or self._options.crops or name in self._sheet.names
+        return self._files.wants_points or self._options.crops or name in self._sheet.tiles
 
     def _find_poses(self) -> Poses | PoseSource | None:
         return choose_poses(
@@ -268,8 +268,9 @@ class _Drive:
             picture = self._draw(tracked, result, title=title)
         if self._files.wants_gif(index):
             small = self._draw(tracked, result, title=time, frame=GIF_FRAME)
-        if tracked.name in self._sheet.names:
-            self._sheet.add(self._draw(tracked, result, title=tracked.name, frame=TILE_FRAME))
+        if tile := self._sheet.tiles.get(tracked.name):
+            with written(tile):
+                save_png(tile, self._draw(tracked, result, title=tracked.name, frame=TILE_FRAME))
         with undisturbed():
             self._write_crops(tracked, result)
             self._files.write(result)
@@ -282,7 +283,7 @@ class _Drive:
         """What belongs to a sweep, as far as the files show it."""
         xyz, intensity = kept.take_points() if self._wants_points(kept.name) else (None, None)
         trails: Mapping[int, np.ndarray] = {}
-        if self._files.wants_trails or self._sheet.names:
+        if self._files.wants_trails or self._sheet.tiles:
             assert tracked.tracks is not None
             assert tracked.T_world_sensor is not None
             trails = self._trails.add(tracked.tracks, tracked.T_world_sensor, record["time_s"])
@@ -298,7 +299,7 @@ class _Drive:
     def _read_image(self, sweep: io.Sweep) -> np.ndarray | None:
         if self._files.wants_image:
             return sweep.read_image()
-        if sweep.name in self._sheet.names:
+        if sweep.name in self._sheet.tiles:
             # No sweep is lost for want of a picture that nobody asked for.
             with contextlib.suppress(io.InputError, OSError):
                 return sweep.read_image()
