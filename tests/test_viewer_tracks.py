@@ -26,6 +26,8 @@ from jaxbox.viewer import (
     words,
 )
 from jaxbox.viewer.drives import split_drives
+from jaxbox.viewer.legend import describe_legend
+from jaxbox.viewer.scene import COMPARED
 from jaxbox.viz.colors import color_by_id
 from jaxbox.viz.tracks import ARROW_S
 
@@ -232,6 +234,24 @@ def test_without_tracks_or_the_wish_for_them_the_scene_has_boxes_as_ever(last):
             np.testing.assert_array_equal(scene.lines[name].segments, lines.segments)
     hidden = build_scene(frame, detections, View(tracks=True, boxes=False, labels=False), tracked)
     assert (len(hidden.lines["boxes"].segments), hidden.captions) == (0, ())
+
+
+def test_the_legend_tells_tracks_and_those_compared_have_one_colour(last):
+    frame, detections, tracked, _ = last
+    scene = build_scene(frame, detections, View(tracks=True), tracked, title="one")
+    other = build_scene(frame, detections, View(tracks=True), tracked, title="two", compared=True)
+    legend = describe_legend(scene, other)
+    for text in (
+        "track: one",
+        "track that is hidden now",
+        "track: two",
+        "trail: the last 2 s",
+        "arrow: in 1 s",
+    ):
+        assert f"<span>{text}</span>" in legend
+    for name in ("boxes", "trails", "arrows"):
+        assert (other.lines[name].end_colors == COMPARED).all()
+        assert len(other.lines[name].segments) == len(scene.lines[name].segments) > 0
 
 
 def test_the_words_count_what_tracks_do(last):

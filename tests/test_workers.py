@@ -136,3 +136,10 @@ def test_what_was_there_before_the_source_broke_off_is_handed_out_first():
     assert [next(pairs), next(pairs)] == [(1, 2), (2, 3)]
     with pytest.raises(OSError, match="ends here"):
         next(pairs)
+
+
+def test_a_system_without_signal_masks_is_asked_for_none(monkeypatch):
+    # Windows has neither the function nor what the tracker of resources is started with.
+    monkeypatch.delattr(signal, "pthread_sigmask")
+    monkeypatch.setattr(processes.resource_tracker, "ensure_running", lambda: pytest.fail("not there"))
+    processes._keep_interrupts_away()

@@ -1,6 +1,6 @@
-"""Takes the README's picture of the viewer, in a headless browser, of a synthetic sweep.
+"""Takes the documentation's pictures of the viewer, in a headless browser, of a synthetic sweep.
 
-``python tests/viewer_picture.py docs/viewer.png`` needs the extra ``test`` and Chromium.
+``python tests/viewer_picture.py docs`` needs the extra ``test`` and Chromium.
 """
 
 import pathlib
@@ -12,8 +12,8 @@ from browser import chromium
 from PIL import Image
 from viewer_sweeps import write_kitti
 
-from jaxbox import io, synthetic
-from jaxbox.viewer import open_viewer
+from jaxbox import DetectorConfig, enable_cache, io, synthetic
+from jaxbox.viewer import Comparison, View, Wanted, open_viewer
 
 SEED = 0
 NUM_SWEEPS = 4
@@ -24,24 +24,40 @@ SETTLE_MS = 6000
 """For the last frame to be drawn without a graphics card."""
 
 
-def main(path: pathlib.Path) -> None:
-    """Takes the picture."""
-    with tempfile.TemporaryDirectory() as folder:
-        root = pathlib.Path(folder) / "training"
+def main(folder: pathlib.Path) -> None:
+    """Takes the pictures: a dark page, and a light one that compares two presets."""
+    # As the command does: times of compiling would be those of the machine's other work.
+    enable_cache()
+    paper = Comparison(title="paper", config=DetectorConfig.paper())
+    with tempfile.TemporaryDirectory() as sweeps:
+        root = pathlib.Path(sweeps) / "training"
         sweep = synthetic.make_sweep(SEED, image=True)
         for index in range(NUM_SWEEPS):
             write_kitti(root, f"{index:06d}", sweep, pedestrian=False)
-        with open_viewer(io.open_sweeps(root)) as (viewer, url):
-            thread = threading.Thread(target=viewer.run)
-            thread.start()
-            try:
-                _take(url, path)
-            finally:
-                viewer.stop()
-                thread.join()
+        _serve(root, folder / "viewer.png", tab="Boxes")
+        _serve(root, folder / "viewer_compare.png", tab="View", light=True, comparison=paper)
 
 
-def _take(url: str, path: pathlib.Path) -> None:
+def _serve(
+    root: pathlib.Path,
+    path: pathlib.Path,
+    *,
+    tab: str,
+    light: bool = False,
+    comparison: Comparison | None = None,
+) -> None:
+    wanted = Wanted(view=View(light=light))
+    with open_viewer(io.open_sweeps(root), wanted=wanted, comparison=comparison) as (viewer, url):
+        thread = threading.Thread(target=viewer.run)
+        thread.start()
+        try:
+            _take(url, path, tab)
+        finally:
+            viewer.stop()
+            thread.join()
+
+
+def _take(url: str, path: pathlib.Path, tab: str) -> None:
     with chromium(size_px=SIZE_PX) as visit:
         visit.open(url)
         # Once more, for times without the compiler and the first reading of the files.
@@ -51,7 +67,7 @@ def _take(url: str, path: pathlib.Path) -> None:
         while notice.count():
             notice.first.click()
             visit.page.wait_for_timeout(500)
-        visit.tab("Boxes")
+        visit.tab(tab)
         visit.page.mouse.move(SIZE_PX[0] // 2, 20)
         visit.page.wait_for_timeout(SETTLE_MS)
         picture = Image.fromarray(visit.picture())

@@ -10,6 +10,7 @@ from jaxbox.viewer.scene import Scene
 
 _BEHIND, _ABOVE, _LEAST_M = 2.2, 1.2, 8.0
 """The camera stands so many lengths behind and above a box, and at least this far."""
+_NUMBER = "text-align: right; white-space: nowrap"
 _FLY = (
     "const name = this.dataset.box; Array.from(document.querySelectorAll('button'))"
     ".filter(button => button.textContent === name)[0].click()"
@@ -105,6 +106,6 @@ def _lines(rows: Sequence[BoxRow]) -> list[str]:
 
 def _cells(texts: Sequence[str]) -> str:
     return "".join(
-        f"<td style='text-align: {side}; padding: 0.2em 0.4em'>{text}</td>"
-        for side, text in zip(("right", "left", "right", "right"), texts, strict=True)
+        f"<td style='{style}; padding: 0.2em 0.4em'>{text}</td>"
+        for style, text in zip((_NUMBER, "text-align: left", _NUMBER, _NUMBER), texts, strict=True)
     )

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxbox.tracking.trails import TRAIL_S
+from jaxbox.viewer.motion import darker
 from jaxbox.viewer.scene import COMPARED, GROUND_COLOR, OBSTACLE_COLOR, Scene, View, on_page
 from jaxbox.viz.colors import (
     ESTIMATE,
@@ -77,10 +78,13 @@ def _boxes(scene: Scene, compared: Scene | None) -> list[str]:
     if not view.boxes:
         return []
     by_id = view.tracks and "trails" in scene.lines
-    text = "track; darker: not seen now" if by_id else "box"
+    text = "track" if by_id else "box"
     entries = [_entry(_named(text, scene.title), _IDS if by_id else [ESTIMATE], view, _LINE)]
+    if by_id:
+        hidden = [darker(color) for color in _IDS]
+        entries.append(_entry("track that is hidden now", hidden, view, _LINE))
     if compared is not None:
-        entries.append(_entry(_named("box", compared.title), [COMPARED], view, _LINE))
+        entries.append(_entry(_named(text, compared.title), [COMPARED], view, _LINE))
     return entries
 
 

@@ -10,6 +10,7 @@ from jaxbox.types import Motion
 from jaxbox.viewer.drives import TrackedFrame
 from jaxbox.viewer.space import Lines
 from jaxbox.viz import BoxGroup
+from jaxbox.viz.colors import Color
 from jaxbox.viz.tracks import ARROW_S, shown_rows, track_groups
 
 HEAD_M, MIN_SPEED_MPS = 1.0, 0.1
@@ -31,7 +32,7 @@ def shown_groups(tracked: TrackedFrame, *, min_score: float) -> dict[int, BoxGro
     groups = track_groups(tracked.tracks, min_score=min_score)
     seen = (np.asarray(tracked.tracks.sight)[rows] == Sight.SEEN).tolist()
     return {
-        row: group if is_seen else dataclasses.replace(group, color=_darker(group))
+        row: group if is_seen else dataclasses.replace(group, color=darker(group.color))
         for row, group, is_seen in zip(rows, groups, seen, strict=True)
     }
 
@@ -56,8 +57,13 @@ def motion_lines(tracked: TrackedFrame, groups: Mapping[int, BoxGroup]) -> dict[
     return {"trails": Lines.join(trails), "arrows": Lines.join(arrows)}
 
 
-def _darker(group: BoxGroup) -> tuple[int, int, int]:
-    red, green, blue = group.color
+def darker(color: Color) -> Color:
+    """The colour of a track that the sweep did not see.
+
+    >>> darker((200, 100, 1))
+    (100, 50, 0)
+    """
+    red, green, blue = color
     return red // 2, green // 2, blue // 2
 
 

@@ -41,7 +41,7 @@ _SWITCHES = (
 )
 
 Point = tuple[float, float, float]
-_WHOLE_M = 40.0
+_WHOLE_M = 55.0
 """A camera sees two scenes so far apart from twice as far."""
 _LOOKS: Mapping[str, tuple[Point, Point]] = {
     "behind": ((-17.0, 0.0, 11.0), (7.0, 0.0, -2.0)),

@@ -111,13 +111,13 @@ def build_scene(
     found = _no_boxes()
     if detections is not None:
         found = BoxSet.from_detections(detections, min_score=view.min_score)
-    groups = [BoxGroup(name="box", boxes=found, color=ESTIMATE)]
-    motion: Mapping[str, Lines] = {}
+    by_row = {0: BoxGroup(name="box", boxes=found, color=ESTIMATE)}
     if view.tracks and tracked is not None:
         by_row = shown_groups(tracked, min_score=view.min_score)
-        groups, motion = list(by_row.values()), motion_lines(tracked, by_row)
     if compared:
-        groups = [dataclasses.replace(group, color=COMPARED) for group in groups]
+        by_row = {row: dataclasses.replace(group, color=COMPARED) for row, group in by_row.items()}
+    groups = list(by_row.values())
+    motion = motion_lines(tracked, by_row) if view.tracks and tracked is not None else {}
     shown = groups if view.boxes else []
     hulls = [] if detections is None or not view.hulls else _hull_lines(detections, found, view.min_score)
     vehicles, others = (
