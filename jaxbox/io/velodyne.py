@@ -227,7 +227,7 @@ def calibrated_sensor(path: pathlib.Path) -> VelodyneSensor:
       ImportError: without the extra ``velodyne``.
     """
     file = _calibration_file(path)
-    return ANY_MODEL if file is None else _read_calibration(file)
+    return ANY_MODEL if file is None else read_calibrated_sensor(file)
 
 
 def _calibration_file(path: pathlib.Path) -> pathlib.Path | None:
@@ -237,7 +237,19 @@ def _calibration_file(path: pathlib.Path) -> pathlib.Path | None:
     return next((place for place in places if place.is_file()), None)
 
 
-def _read_calibration(file: pathlib.Path) -> VelodyneSensor:
+def read_calibrated_sensor(file: pathlib.Path) -> VelodyneSensor:
+    """What a calibration says of a sensor.
+
+    Args:
+      file: YAML (ROS's driver) or XML (Velodyne).
+
+    Returns:
+      Calibration, and the model where that follows.
+
+    Raises:
+      InputError: where the file cannot be read.
+      ImportError: without the extra ``velodyne``.
+    """
     text = read_text(file)
     if file.suffix == ".xml":
         text = _yaml_of_xml(text, str(file))

@@ -13,20 +13,21 @@ import socket
 import struct
 import sys
 from collections.abc import Iterator
-from typing import Any
-
-import numpy as np
 
 from jaxbox._extras import require
-from jaxbox._files import read_text, reason
 from jaxbox.io import InputError, TimedPoints
+from jaxbox.io.velodyne import (
+    PACKET_BYTES,
+    TurnBatcher,
+    VelodynePoints,
+    VelodyneSensor,
+    read_calibrated_sensor,
+)
 from jaxbox.live.sweep import IDLE_S, Fault, LiveSweep, now_ns
 from jaxbox.viewer.server import LOOPBACK_NAMES
 
 PORT = 2368
 """To which Velodyne sensors send unless they are told otherwise."""
-PACKET_BYTES = 1206
-"""Of each packet of points."""
 MAX_PACKETS = 8192
 """A turn has fewer: the VLS-128 sends 12,600 a second with two returns, and turns 5 times a second."""
 _BUFFER_BYTES = 2**22
@@ -36,7 +37,6 @@ _STAMP = struct.Struct("@ll")
 _LOST = struct.Struct("@I")
 _SO_TIMESTAMPNS, _SO_RXQ_OVFL = 35, 40
 """Linux's numbers, which Python does not name: packets come with their time, and with how many were lost."""
-_TIME_COLUMN = 4
 _NS_PER_S = 10**9
 
 
@@ -54,7 +54,7 @@ class UdpAddress:
     """Name of the model, as ``velodyne_decoder.Model`` has it; None for what the packets say, which those of
     an HDL-64E do not."""
     calibration: pathlib.Path | None = None
-    """Calibration of the lasers, YAML; None for the model's own."""
+    """Calibration of the lasers, YAML or XML; None for the model's own."""
 
     @property
     def is_open(self) -> bool:
@@ -77,15 +77,15 @@ class VelodyneSource:
           InputError: for an address that cannot be listened at, an unknown model, or a bad calibration.
           ImportError: without the extra ``velodyne``.
         """
-        self._library = require("velodyne_decoder", extra="velodyne", what="Velodyne packets")
         self.is_open = address.is_open
         """Whether whoever reaches the port may send."""
         self._address = address
-        self._decoder = _Decoder(self._library, _config_of(self._library, address))
+        sensor = _sensor_of(address)
         self._socket = _listening(address)
         self.port: int = self._socket.getsockname()[1]
         """At which it listens."""
         self.name = f"udp://{address.host}:{self.port}"
+        self._turns = _Turns(sensor, "a turn")
         self.hint = f"is the sensor on, and does it send to this machine at port {self.port}?"
 
     def __iter__(self) -> Iterator[LiveSweep | Fault | None]:
@@ -97,7 +97,7 @@ class VelodyneSource:
                 received = _receive(self._socket)
                 if received is None:
                     # Half a turn before a silence and half a turn after it are no sweep.
-                    self._decoder.reset()
+                    self._turns.reset()
                     sender = self._address.sender
                     yield None
                     continue
@@ -111,71 +111,61 @@ class VelodyneSource:
                     yield Fault(f"{self.name}: a packet from {host}, while {sender} is listened to.")
                     continue
                 try:
-                    points = self._decoder.add(packet, stamp_ns)
-                except ValueError as error:
+                    turn = self._turns.add(packet, stamp_ns)
+                except InputError as error:
                     yield Fault(f"{self.name}: {error} It came from {host}.")
                     continue
                 sender = host
-                yield None if points is None else _sweep(points, frame, stamp_ns)
-                frame += points is not None
+                yield None if turn is None else _sweep(*turn, frame)
+                frame += turn is not None
 
 
-class _Decoder:
-    """The library's decoder, which begins anew where what comes cannot be a turn."""
+class _Turns:
+    """Packets of a sensor as they come, put together to turns, which are decoded whole."""
 
-    def __init__(self, library: Any, config: Any) -> None:
-        self._library, self._config = library, config
+    def __init__(self, sensor: VelodyneSensor, where: str) -> None:
+        self._sensor, self._where = sensor, where
         self.reset()
 
     def reset(self) -> None:
-        """Forgets the turn that was begun, and which model it was."""
-        self._stream, self._num_packets = self._library.StreamDecoder(self._config), 0
+        """Forgets the turn that was begun."""
+        self._batcher, self._num_packets = TurnBatcher(), 0
 
-    def add(self, packet: bytes, stamp_ns: int) -> TimedPoints | None:
-        """The points of a turn with its last packet, else None.
+    def add(self, packet: bytes, stamp_ns: int) -> tuple[TimedPoints, int] | None:
+        """The points of a turn and when its last packet came, with the packet that begins the next.
 
         Raises:
-          ValueError: for what is no packet, or does not end a turn when it must.
+          InputError: for what is no packet, does not end a turn when it must, or cannot be decoded.
         """
         if len(packet) != PACKET_BYTES:
-            raise ValueError(f"{len(packet)} bytes, and packets of a Velodyne sensor have {PACKET_BYTES}.")
-        try:
-            found = self._stream.decode(stamp_ns / _NS_PER_S, packet)
-        except RuntimeError as error:
-            self.reset()
-            raise ValueError(f"a packet that cannot be decoded ({reason(error)}).") from error
+            raise InputError(f"{len(packet)} bytes, and packets of a Velodyne sensor have {PACKET_BYTES}.")
+        turn = self._batcher.push(stamp_ns, packet)
         self._num_packets += 1
-        if found is None:
-            if self._num_packets > MAX_PACKETS:
-                self.reset()
-                raise ValueError(f"{MAX_PACKETS} packets, and the sensor has not turned round.")
-            return None
-        self._num_packets = 0
-        values = found[1]
-        return TimedPoints(values[:, :3], values[:, 3], values[:, _TIME_COLUMN].astype(np.float64))
+        if turn is not None:
+            self._num_packets = 0
+            ended_ns = turn[-1][0]
+            return VelodynePoints(turn, self._sensor, self._where, (ended_ns, "")).timed(), ended_ns
+        if self._num_packets > MAX_PACKETS:
+            self.reset()
+            raise InputError(f"{MAX_PACKETS} packets, and the sensor has not turned round.")
+        return None
 
 
-def _sweep(points: TimedPoints, frame: int, stamp_ns: int) -> LiveSweep:
+def _sweep(points: TimedPoints, ended_ns: int, frame: int) -> LiveSweep:
     return LiveSweep(
-        name=f"{frame:06d}", frame=frame, timestamp_ns=stamp_ns, arrived_ns=stamp_ns, points=points
+        name=f"{frame:06d}", frame=frame, timestamp_ns=ended_ns, arrived_ns=ended_ns, points=points
     )
 
 
-def _config_of(library: Any, address: UdpAddress) -> Any:
-    models = library.Model.__members__
+def _sensor_of(address: UdpAddress) -> VelodyneSensor:
+    """What an address says of the sensor that sends to it."""
+    models = require("velodyne_decoder", extra="velodyne", what="Velodyne packets").Model.__members__
     if address.model is not None and address.model not in models:
         raise InputError(f"model {address.model} is not known; name one of {', '.join(models)}.")
-    model = None if address.model is None else models[address.model]
-    calibration = None
-    if address.calibration is not None:
-        text = read_text(address.calibration)
-        try:
-            calibration = library.Calibration.from_string(text)
-        except RuntimeError as error:
-            raise InputError(
-                f"{address.calibration}: not a calibration of a Velodyne sensor ({reason(error)})."
-            ) from error
-    return library.Config(model=model, calibration=calibration)
+    if address.calibration is None:
+        return VelodyneSensor(address.model)
+    calibrated = read_calibrated_sensor(address.calibration)
+    return calibrated._replace(model=address.model or calibrated.model)
 
 
 def _listening(address: UdpAddress) -> socket.socket:
