@@ -591,8 +591,9 @@ def soak() -> str:
     """The figures of the runs of the soak."""
     report = load("soak")
     first = "small synthetic sweeps" if report["circumstances"]["options"]["quick"] else "real sweeps"
-    runs = {first: report["real"], "any size": report["varied"], "drives, tracked": report["tracked"]}
-    points = [f"{run['points']['minimum']:,} to {run['points']['maximum']:,}" for run in runs.values()]
+    names = {"real": first, "varied": "any size", "tracked": "drives, tracked"}
+    runs = {name: report[run] for run, name in names.items() if run in report}
+    points = ["{:,} to {:,}".format(*sorted(run["points"].values())[::2]) for run in runs.values()]
     rows: list[tuple[Any, ...]] = [
         ("frames", *(f"{run['frames']:,}" for run in runs.values())),
         ("points of a frame", *points),
