@@ -24,7 +24,7 @@ from jaxbox.cli.report import (
     describe_frame,
     describe_run,
 )
-from jaxbox.cli.run_sheet import TILE_FRAME
+from jaxbox.cli.run_sheet import TILE_FOLDER, TILE_FRAME
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation.report import read_folders
 from jaxbox.io import (
@@ -335,7 +335,7 @@ def test_one_broken_sweep_is_reported_and_the_others_are_done(kitti_folder, tmp_
     assert "000000.bin" in result.stderr
     assert "16" in result.stderr
     assert "1 sweeps done, 1 failed" in result.stdout
-    names = ["000001.txt", "config.toml", "contact_sheet.png", "run.json"]
+    names = [TILE_FOLDER, "000001.txt", "config.toml", "contact_sheet.png", "run.json"]
     assert sorted(path.name for path in output.iterdir()) == names
     account = json.loads((output / "run.json").read_text())
     assert (account["num_done"], account["failures"][0]["sweep"]) == (1, "000000")

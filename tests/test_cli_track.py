@@ -437,7 +437,7 @@ def test_options_that_cannot_be_used_say_so(kitti, tmp_path, arguments, words):
 
 
 def test_an_empty_recording_is_an_error(tmp_path, monkeypatch):
-    monkeypatch.setattr(io, "open_sweeps", lambda paths, topic: [])
+    monkeypatch.setattr(io, "open_sweeps", lambda paths, **_: [])
     result = run("track", tmp_path, "--output", tmp_path / "out")
     assert result.exit_code == 2
     assert "the recording is empty" in result.stderr

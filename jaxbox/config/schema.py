@@ -358,8 +358,8 @@ class HealthConfig:
     """From where on the status doubts a sweep. No real sweep in clear weather that was at hand comes near."""
 
     far_m: Scalar = 40.0
-    """Points farther than this, or outside the region, are far; for a sensor below 1.73 m what is farther
-    than this in proportion to its height."""
+    """Points farther than this, or outside the region, are far; for a sensor .2 to .8 m high what is
+    farther than this in proportion to its height."""
     min_far_share: Scalar = 0.004
     """With a smaller share of far points the sweep is `DEGRADED`; 0 for sweeps that are cut off nearer."""
     max_scattered_share: Scalar = 0.2

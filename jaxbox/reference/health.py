@@ -13,8 +13,8 @@ GROUND_BAND_M = 0.3
 """Points at most so far from the ground are compared,"""
 ROUGH_M = 0.05
 """and are rough where they are farther than this."""
-USUAL_HEIGHT_M = 1.73
-"""A sensor lower than this sees less far: what is far is nearer in proportion."""
+LOW_M, MIN_HEIGHT_M = 0.8, 0.2
+"""What is far is nearer in proportion for a sensor between these heights."""
 UNDER_RATIO = 0.6
 """Ground nearer than this share of the sensor's height is right under it."""
 
@@ -42,7 +42,8 @@ def measure_health(
     near &= ground.surface is not None
     sensor_height_m = -ground.planes[0, 2]
     under = (off_ground < ground_config.min_height_m) & (rho < UNDER_RATIO * sensor_height_m)
-    far_m = config.far_m * np.clip(sensor_height_m / USUAL_HEIGHT_M, 0, 1)
+    is_low = MIN_HEIGHT_M <= sensor_height_m < LOW_M
+    far_m = config.far_m * (sensor_height_m / LOW_M if is_low else 1)
     scattered = 0
     if evidence is not None:
         hit, free = (

@@ -18,8 +18,9 @@ NEAR_M = (3.0, 12.0)
 GROUND_BAND_M, ROUGH_M = 0.3, 0.05
 """What is nearer to the ground than the first counts, and is rough beyond the second; roads are flatter."""
 
-USUAL_HEIGHT_M = 1.73
-"""Of a sensor on a roof (KITTI's). A lower one sees less far over the ground, and what is far is nearer."""
+LOW_M, MIN_HEIGHT_M = 0.8, 0.2
+"""A sensor between these heights sees less far over the ground, and what is far is nearer. Ground that is
+nearer to the origin, or none at all, says nothing."""
 
 UNDER_RATIO = 0.6
 """Nearer than this share of its height no vehicle's sensor sees the road: that is 59 degrees below level."""
@@ -52,9 +53,10 @@ def measure_health(
     follows_road = ground.surface is not None
     near = sweep.inlier & (rho > NEAR_M[0]) & (rho < NEAR_M[1]) & (off_ground < GROUND_BAND_M) & follows_road
     under = sweep.inlier & (off_ground < ground_config.min_height_m)
-    under &= rho < -UNDER_RATIO * ground.plane.coefficients[2]
-    lowness = jnp.clip(-ground.plane.coefficients[2] / USUAL_HEIGHT_M, 0, 1)
-    far = sweep.finite & (~sweep.in_region | (rho > config.far_m * lowness))
+    sensor_height_m = -ground.plane.coefficients[2]
+    under &= rho < UNDER_RATIO * sensor_height_m
+    share = jnp.where(sensor_height_m < MIN_HEIGHT_M, 1, jnp.minimum(sensor_height_m / LOW_M, 1))
+    far = sweep.finite & (~sweep.in_region | (rho > config.far_m * share))
     far, near, rough, under = count_each(far, near, near & (off_ground > ROUGH_M), under)
     return Health(far, _scattered_azimuths(evidence), near, rough, under)
 
