@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 from jaxbox import DetectorConfig, io
 from jaxbox.cli.app import app
-from jaxbox.cli.box_filter import BoxFilter
 from jaxbox.cli.inputs import RunOptions, prepare_run
 from jaxbox.geometry.rigid import rotation_about_z
 from jaxbox.io import PointConvention
@@ -221,16 +220,7 @@ def test_a_run_is_resumed_with_its_own_convention(tmp_path):
         return RunOptions(
             output=pathlib.Path(tmp_path / "out"),
             config=DetectorConfig(),
-            topic=None,
-            sensor_at=None,
-            level=False,
-            capacity=None,
-            min_score=0.0,
-            keep=BoxFilter(),
-            crops=False,
-            sheet=False,
             quiet=True,
-            json=False,
             **changes,
         )
 

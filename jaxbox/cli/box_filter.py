@@ -82,6 +82,10 @@ class BoxFilter:
         return dataclasses.replace(boxes, valid=keep)  # pyright: ignore[reportArgumentType]
 
 
+EVERY_BOX = BoxFilter()
+"""All are kept."""
+
+
 def _parse_classes(text: str) -> tuple[str, ...]:
     known = {name: label.word for label in Label for name in (label.word, label.plural)}
     words = [word.strip().lower() for word in text.split(",")]

@@ -85,8 +85,10 @@ def evaluate(
     of_detecting = {"--preset": preset, "--config": settings, "--set": changes, "--jobs": jobs}
     of_results = {"--tracking": tracking, "--plots": plots, "--drives": drives, "--pictures": pictures}
     of_results |= {"--json": json, "--missing-as-empty": missing_as_empty, "--min-score": min_score}
-    _refuse(of_detecting, unless=protocol is not None, why="it detects nothing; give it with --protocol")
-    _refuse(of_results, unless=protocol is None, why="leave it out with --protocol, and evaluate again then")
+    if protocol is None:
+        _refuse(of_detecting, "{}: it detects nothing; give it with --protocol.")
+    else:
+        _refuse(of_results, "{}: leave it out with --protocol, and evaluate again then.")
     with input_errors():
         if protocol is not None:
             config = chosen_config(preset, settings, changes or [])
@@ -127,13 +129,14 @@ def _check_options(
     """Refuses options of the other kind of results, rather than passing them over."""
     if frames and not tracking:
         raise typer.BadParameter("--frames chooses frames of tracking sequences; give --tracking with it.")
-    of_sweeps = {"--plots": plots, "--drives": drives, "--pictures": pictures}
-    for name, value in of_sweeps.items():
-        if tracking and value:
-            raise typer.BadParameter(f"{name} is for single sweeps; leave it out with --tracking.")
+    if tracking:
+        of_sweeps = {"--plots": plots, "--drives": drives, "--pictures": pictures}
+        _refuse(of_sweeps, "{} is for single sweeps; leave it out with --tracking.")
 
 
-def _refuse(given: Mapping[str, object], *, unless: bool, why: str) -> None:
+def _refuse(given: Mapping[str, object], sentence: str) -> None:
+    """Refuses the first option that was given, by its name in a sentence."""
     for name, value in given.items():
-        if not unless and value not in (None, False):
-            raise typer.BadParameter(f"{name}: {why}.")
+        # A score of 0 was given, too, and equals False.
+        if value is not None and value is not False:
+            raise typer.BadParameter(sentence.format(name))

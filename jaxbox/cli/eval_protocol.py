@@ -2,25 +2,21 @@
 
 import dataclasses
 import pathlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from rich.console import Console
 
 from jaxbox import io
 from jaxbox._version import __version__
-from jaxbox.cli.box_filter import BoxFilter
 from jaxbox.cli.console import ExitCode
 from jaxbox.cli.detect import DetectOptions, run_detect
-from jaxbox.cli.evaluate import METRIC_NAMES, print_report
+from jaxbox.cli.evaluate import METRIC_NAMES, group_curves, print_report
 from jaxbox.cli.results import ResultFormat
 from jaxbox.config import DetectorConfig
 from jaxbox.evaluation import evaluate_folders, kitti
 from jaxbox.evaluation.protocols import Protocol, protocol_frames
 from jaxbox.io import InputError, atomic_writer
-
-TABLE_NAME = "{protocol}.md"
-"""The table, in the folder of the results."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -54,19 +50,19 @@ def run_eval_protocol(
     """
     listed = protocol_frames(options.protocol)
     labelled = {sweep.name for sweep in io.open_sweeps(labels) if sweep.labels_path is not None}
-    frames = [name for name in listed if name in labelled]
+    frames = labelled.intersection(listed)
     if not frames:
         raise InputError(
             f"{labels}: none of the {len(listed):,} frames of {options.protocol} is there with labels; the "
             f"first is velodyne/{listed[0]}.bin with label_2/{listed[0]}.txt. Give KITTI's object folder."
         )
-    ended = run_detect([str(labels)], _detect_options(results, options), frames=frozenset(frames))
+    ended = run_detect([str(labels)], _detect_options(results, options), frames=frames)
     if ended is not ExitCode.OK:
         return ended
-    report = evaluate_folders(labels, results, frames=frozenset(frames))
+    report = evaluate_folders(labels, results, frames=frames)
     print_report(report, console)
     table = markdown_table(report, options.protocol, num_listed=len(listed))
-    path = results / TABLE_NAME.format(protocol=options.protocol)
+    path = results / f"{options.protocol}.md"
     with atomic_writer(path) as handle:
         handle.write(table)
     for line in table.splitlines():
@@ -79,18 +75,8 @@ def _detect_options(results: pathlib.Path, options: ProtocolOptions) -> DetectOp
     return DetectOptions(
         output=results,
         config=options.config,
-        topic=None,
-        sensor_at=None,
-        level=False,
-        capacity=None,
-        min_score=0.0,
-        keep=BoxFilter(),
-        crops=False,
-        sheet=False,
-        resume=True,
-        quiet=False,
-        json=False,
         jobs=options.jobs,
+        resume=True,
         formats=frozenset({ResultFormat.KITTI}),
         points=False,
         pictures=False,
@@ -110,23 +96,17 @@ def markdown_table(report: Mapping[str, Any], protocol: Protocol, *, num_listed:
     """
     num = report["num_frames"]
     frames = f"all {num:,} frames" if num == num_listed else f"only {num:,} of {num_listed:,} frames"
-    curves = [*(c for c in report["kitti"]["curves"] if c["class"] == "Car"), *report["vehicles"]]
-    difficulties = list(dict.fromkeys(curve["difficulty"] for curve in curves))
+    cars = (curve for curve in report["kitti"]["curves"] if curve["class"] == "Car")
+    grouped = group_curves([*cars, *report["vehicles"]])
+    difficulties = list(next(iter(grouped.values())))
     lines = [
         f"jaxbox {__version__}, {protocol}, {frames}: AP over 40 recalls",
         "",
         f"| class, metric, IoU | {' | '.join(difficulties)} |",
         "|---" + "|---:" * len(difficulties) + "|",
-        *_rows(curves),
     ]
+    for (name, metric), levels in grouped.items():
+        overlap = kitti.MIN_OVERLAP.get(name, kitti.VEHICLE_OVERLAP)
+        values = " | ".join(f"{curve['r40']:.2f}" for curve in levels.values())
+        lines.append(f"| {name}, {METRIC_NAMES[metric]}, {overlap:g} | {values} |")
     return "\n".join(lines) + "\n"
-
-
-def _rows(curves: Iterable[Mapping[str, Any]]) -> list[str]:
-    """A row a class and metric, in the order of the curves."""
-    cells: dict[str, list[str]] = {}
-    for curve in curves:
-        overlap = kitti.MIN_OVERLAP.get(curve["class"], kitti.VEHICLE_OVERLAP)
-        name = f"{curve['class']}, {METRIC_NAMES[curve['metric']]}, {overlap:g}"
-        cells.setdefault(name, []).append(f"{curve['r40']:.2f}")
-    return [f"| {name} | {' | '.join(values)} |" for name, values in cells.items()]

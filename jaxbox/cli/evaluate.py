@@ -209,12 +209,17 @@ def _size_row(name: str, errors: Mapping[str, Any]) -> list[str]:
     return [name, *(_number(errors[key], digits) for key, digits in keys)]
 
 
-def precision_table(curves: Iterable[Mapping[str, Any]], title: str = PRECISION_TITLE) -> Table:
-    """KITTI's average precision over 40 recalls, and the most that perfect boxes reach on these sweeps."""
+def group_curves(curves: Iterable[Mapping[str, Any]]) -> dict[tuple[str, str], dict[str, Mapping[str, Any]]]:
+    """Curves by class and metric, and then by difficulty, in their order."""
     grouped: dict[tuple[str, str], dict[str, Mapping[str, Any]]] = {}
     for curve in curves:
         grouped.setdefault((curve["class"], curve["metric"]), {})[curve["difficulty"]] = curve
-    rows = []
+    return grouped
+
+
+def precision_table(curves: Iterable[Mapping[str, Any]], title: str = PRECISION_TITLE) -> Table:
+    """KITTI's average precision over 40 recalls, and the most that perfect boxes reach on these sweeps."""
+    grouped, rows = group_curves(curves), []
     for (class_name, metric), levels in grouped.items():
         cells = [f"{curve['r40']:.2f} of {curve['ceiling_r40']:.2f}" for curve in levels.values()]
         rows.append([f"{class_name}, {METRIC_NAMES.get(metric, metric)}", *cells])

@@ -3,6 +3,7 @@
 import concurrent.futures
 import contextlib
 import dataclasses
+import functools
 import pathlib
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping
@@ -166,13 +167,14 @@ class FrameWork:
         name, min_score = read.sweep.name, self.shown_min_score
         if self.crop_folder is not None:
             write_crops(self.crop_folder, name, read.points, enumerate(detections), min_score=min_score)
+        # Read once for both; an error is raised again.
+        judge = functools.cache(lambda: _judge(read, detections, min_score))
         if name in self.tiles:
             # No sweep fails for want of a picture that nobody asked for.
             with contextlib.suppress(io.InputError, OSError):
-                shown = _judge(read, detections, min_score)
-                save_png(self.tiles[name], _draw_tile(read, detections, shown, min_score))
+                save_png(self.tiles[name], _draw_tile(read, detections, judge(), min_score))
         if self.picture_folder is not None:
-            shown = _judge(read, detections, min_score)
+            shown = judge()
             pictures = draw_stages(
                 cloud,
                 detections,

@@ -8,7 +8,7 @@ from typing import Any
 
 from jaxbox import io
 from jaxbox._files import check_no_link
-from jaxbox.cli.box_filter import BoxFilter
+from jaxbox.cli.box_filter import EVERY_BOX, BoxFilter
 from jaxbox.cli.console import stdout
 from jaxbox.cli.crops import CROP_FOLDER
 from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
@@ -28,29 +28,29 @@ class RunOptions:
     """Folder for results and pictures."""
     config: DetectorConfig
     """The detector's settings."""
-    topic: str | None
+    topic: str | None = None
     """Topic of the points in recordings."""
-    sensor_at: tuple[float, float, float] | None
+    sensor_at: tuple[float, float, float] | None = None
     """Where the sensor is in the frame of the points, m; None for the origin."""
-    level: bool
+    level: bool = False
     """Whether its tilt is measured, and the sweeps are seen upright."""
     convention: io.PointConvention = io.ORDINARY
     """How the numbers of the points are to be taken."""
-    capacity: int | None
+    capacity: int | None = None
     """Points a sweep is padded to, or None for what it needs."""
-    min_score: float
+    min_score: float = 0.0
     """Boxes with lower scores are dropped."""
-    keep: BoxFilter
+    keep: BoxFilter = EVERY_BOX
     """Which other boxes are dropped."""
-    crops: bool
+    crops: bool = False
     """Whether the points in each box are written."""
-    sheet: bool
+    sheet: bool = False
     """Whether there is a contact sheet of the run."""
     resume: bool
     """Whether what has complete results is passed over."""
-    quiet: bool
+    quiet: bool = False
     """Whether only errors are printed."""
-    json: bool
+    json: bool = False
     """Whether stdout is JSON Lines."""
     jobs: int = 1
     """Processes that detect."""

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from jaxbox.cli.config_options import chosen_config, chosen_track_config, complete_track_setting
+from jaxbox.cli.config_options import chosen_config, chosen_track_config
 from jaxbox.cli.console import input_errors
 from jaxbox.cli.live import LiveOptions, run_live
 from jaxbox.cli.options import (
@@ -12,6 +12,7 @@ from jaxbox.cli.options import (
     ColumnsOption,
     FlipOption,
     LevelOption,
+    MaxTracksOption,
     PresetOption,
     QuietOption,
     ScaleOption,
@@ -20,6 +21,7 @@ from jaxbox.cli.options import (
     SetOption,
     SettingsOption,
     TopicOption,
+    TrackSetOption,
 )
 from jaxbox.io import InputError, PointConvention
 from jaxbox.live import LiveConfig
@@ -103,16 +105,8 @@ def live(
     sensor: SensorOption = None,
     settings: SettingsOption = None,
     changes: SetOption = None,
-    track_changes: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--track-set",
-            metavar="FIELD=VALUE",
-            help="Change one setting of the tracker by its name; repeatable.",
-            autocompletion=complete_track_setting,
-        ),
-    ] = None,
-    max_tracks: Annotated[int, typer.Option(min=1, help="Vehicles at a time.")] = MAX_TRACKS,
+    track_changes: TrackSetOption = None,
+    max_tracks: MaxTracksOption = MAX_TRACKS,
     topic: TopicOption = None,
     sensor_at: SensorAtOption = None,
     level: LevelOption = False,

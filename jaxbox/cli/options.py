@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from jaxbox.cli.config_options import complete_preset, complete_setting
+from jaxbox.cli.config_options import complete_preset, complete_setting, complete_track_setting
 
 EXIT_CODES = (
     "Exit codes: 0 all went well; 1 some sweeps failed, the others are done; 2 the input or an option cannot "
@@ -58,6 +58,16 @@ SetOption = Annotated[
         autocompletion=complete_setting,
     ),
 ]
+TrackSetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--track-set",
+        metavar="FIELD=VALUE",
+        help="Change one setting of the tracker by its name; repeatable.",
+        autocompletion=complete_track_setting,
+    ),
+]
+MaxTracksOption = Annotated[int, typer.Option(min=1, help="Vehicles at a time.")]
 TopicOption = Annotated[str | None, typer.Option(help="Topic of the points, for recordings of several.")]
 
 

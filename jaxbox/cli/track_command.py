@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from jaxbox.cli.box_filter import BoxFilter, ClassesOption, WithinOption
-from jaxbox.cli.config_options import chosen_config, chosen_track_config, complete_track_setting
+from jaxbox.cli.config_options import chosen_config, chosen_track_config
 from jaxbox.cli.console import input_errors
 from jaxbox.cli.options import (
     AddressOption,
@@ -19,6 +19,7 @@ from jaxbox.cli.options import (
     FlipOption,
     JsonOption,
     LevelOption,
+    MaxTracksOption,
     PresetOption,
     QuietOption,
     ScaleOption,
@@ -28,6 +29,7 @@ from jaxbox.cli.options import (
     SettingsOption,
     SheetOption,
     TopicOption,
+    TrackSetOption,
 )
 from jaxbox.cli.ray_engine import check_local, check_ray
 from jaxbox.cli.report import SHOWN_MIN_SCORE
@@ -134,16 +136,8 @@ def track(
     sensor: SensorOption = None,
     settings: SettingsOption = None,
     changes: SetOption = None,
-    track_changes: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--track-set",
-            metavar="FIELD=VALUE",
-            help="Change one setting of the tracker by its name; repeatable.",
-            autocompletion=complete_track_setting,
-        ),
-    ] = None,
-    max_tracks: Annotated[int, typer.Option(min=1, help="Vehicles at a time.")] = MAX_TRACKS,
+    track_changes: TrackSetOption = None,
+    max_tracks: MaxTracksOption = MAX_TRACKS,
     topic: TopicOption = None,
     sensor_at: SensorAtOption = None,
     level: LevelOption = False,

@@ -239,9 +239,9 @@ def _load_cvat(path: pathlib.Path, _changed_ns: int) -> tuple[list[Any], dict[st
     """Classes, and the annotations of each sweep, of a file that each sweep asks for, read once."""
     content = _cvat_content(path)
     labels = content.get("categories", {}).get("label", {}).get("labels", [])
+    items = _items_of(content, path)
     # CVAT puts folders of the upload before the name.
-    items = {str(item["id"]).rpartition("/")[2]: item["annotations"] for item in read_cvat_items(path)}
-    return labels, items
+    return labels, {str(item["id"]).rpartition("/")[2]: item["annotations"] for item in items}
 
 
 def read_cvat_items(path: pathlib.Path) -> list[Any]:
@@ -253,7 +253,11 @@ def read_cvat_items(path: pathlib.Path) -> list[Any]:
     Raises:
       InputError: where it cannot be read.
     """
-    items = _list_of(_cvat_content(path), "items", path)
+    return _items_of(_cvat_content(path), path)
+
+
+def _items_of(content: Any, path: pathlib.Path) -> list[Any]:
+    items = _list_of(content, "items", path)
     if not all(isinstance(item, dict) and isinstance(item.get("annotations"), list) for item in items):
         raise InputError(f"{path}: its items must have annotations; export it again as Datumaro 3D.")
     return items
@@ -273,13 +277,6 @@ def _cvat_content(path: pathlib.Path) -> Any:
             if archive.getinfo(names[0]).file_size > _MAX_JSON_BYTES:
                 raise InputError(f"{path}: {names[0]} unpacks to more than {_MAX_JSON_BYTES} bytes.")
             text = archive.read(names[0]).decode("utf-8-sig")
-    except (
-        zipfile.BadZipFile,
-        NotImplementedError,
-        RuntimeError,
-        OSError,
-        EOFError,
-        UnicodeDecodeError,
-    ) as error:
+    except _ZIP_ERRORS as error:
         raise InputError(f"{path}: not a zip of annotations ({reason(error)}).") from error
     return parse_json(text, f"{path}, {names[0]}")

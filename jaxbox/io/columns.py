@@ -1,5 +1,6 @@
 """How many columns a file of float32 without a header has: what only the numbers themselves can say."""
 
+import math
 import os
 from collections.abc import Mapping
 
@@ -14,7 +15,7 @@ COLUMNS: Mapping[int, str] = {
 }
 """Columns that files have, with what is in them; of more than these `told_columns` does not think."""
 
-_PERIOD = 60
+_PERIOD = math.lcm(*COLUMNS)
 """The least number of values that is whole rows of any of them."""
 _NUM_PERIODS = 50
 _MIN_ROWS = 100

@@ -140,4 +140,4 @@ def _ray_table(metadata: str) -> Any:
     return core.XYZLut(core.SensorInfo(metadata), use_extrinsics=False)
 
 
-OSF = RecordingFormat(name="Ouster OSF", suffixes=(".osf",), open=open_ouster, read_poses=lambda _: iter(()))
+OSF = RecordingFormat(name="Ouster OSF", suffixes=(".osf",), open=open_ouster)

@@ -47,8 +47,8 @@ class RecordingFormat:
     """Lower-case ends of its file names."""
     open: Callable[[pathlib.Path, str | None], "RecordedSweeps"]
     """Opens one by its path and the topic to take, None for the only one."""
-    read_poses: Callable[[pathlib.Path], Iterator[PoseMessage]]
-    """Reads its odometry and transforms, in the order of time."""
+    read_poses: Callable[[pathlib.Path], Iterator[PoseMessage]] = lambda _: iter(())
+    """Reads its odometry and transforms, in the order of time; none where its kind has none."""
     is_folder: Callable[[pathlib.Path], bool] = lambda _: False
     """Whether a folder is one of them."""
 

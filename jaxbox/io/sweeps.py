@@ -83,7 +83,6 @@ def open_sweeps(
       path: a point file, a recording (ROS bag, MCAP, a capture of packets), a folder of either, a KITTI,
         Argoverse 2 or nuScenes folder, a pattern such as ``"drive/*.pcd"``, or several of them.
       topic: of the points in recordings, in captures sender and port; None where each has only one.
-
       convention: how the numbers are to be taken, where they are not metres with x forward, y left, z up.
 
     Returns:

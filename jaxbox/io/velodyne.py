@@ -388,9 +388,4 @@ def open_capture(path: pathlib.Path, topic: str | None = None) -> RecordedSweeps
     return open_velodyne_capture(path, topic)
 
 
-CAPTURE = RecordingFormat(
-    name="captures of packets",
-    suffixes=(".pcap", ".pcapng"),
-    open=open_capture,
-    read_poses=lambda _: iter(()),
-)
+CAPTURE = RecordingFormat(name="captures of packets", suffixes=(".pcap", ".pcapng"), open=open_capture)
