@@ -26,6 +26,7 @@ from jaxbox.live import (
     RecordedSource,
     foxglove,
     loop,
+    page,
     recorded,
 )
 from jaxbox.live.mailbox import Closed, Mailbox
@@ -366,3 +367,16 @@ def test_a_port_that_foxglove_cannot_have_is_said():
             foxglove.open_foxglove(port=port),
         ):
             pass
+
+
+def test_the_page_holds_the_rows_that_the_detector_had():
+    points = np.random.default_rng(0).uniform(1, 20, (100, 3)), None
+    sweep = types.SimpleNamespace(name="a", frame=0, timestamp_ns=0, read_points=lambda: points)
+    detections = types.SimpleNamespace(ground_mask=np.zeros(64, bool))
+    found = types.SimpleNamespace(detections=detections)
+    newest = page._Newest(lambda config: None)
+    newest.put(types.SimpleNamespace(sweep=sweep, found=found, num_skipped=0), None)  # pyright: ignore
+    frame = newest.frame(0)
+    assert frame.cloud.capacity == 64
+    assert frame.rows.max() < 64
+    assert frame.num_points == 100

@@ -136,6 +136,16 @@ def test_packets_of_another_sender_are_refused_while_the_first_one_sends():
     assert all("127.0.0.2, while 127.0.0.1 is listened to" in reason for reason in listening.faults)
 
 
+def test_a_sender_that_falls_silent_leaves_its_place_to_another_that_sends_all_the_time():
+    with Listening() as listening:
+        listening.send(turns()[0][:20])
+        for packet in [*turns()[1], *turns()[2], *turns()[3]]:
+            listening.send([packet], sender="127.0.0.2")
+            time.sleep(2 * velodyne.IDLE_S / 75)
+        listening.wait(lambda: len(listening.sweeps) >= 1)
+    assert len(listening.faults) < 75
+
+
 def test_a_named_sender_is_the_only_one():
     with Listening(sender="127.0.0.2") as listening:
         listening.send(turns()[0][:2])

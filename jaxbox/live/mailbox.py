@@ -20,7 +20,7 @@ class Mailbox(Generic[T]):
         self._closed = False
         self._error: BaseException | None = None
         self.num_skipped = 0
-        """Items whose place was taken before anybody fetched them."""
+        """Items whose place was taken before anybody fetched them, and those of `skip`."""
 
     def put(self, item: T) -> None:
         """Leaves an item.
@@ -32,6 +32,11 @@ class Mailbox(Generic[T]):
             self.num_skipped += self._item is not None
             self._item = item
             self._changed.notify_all()
+
+    def skip(self) -> None:
+        """Counts an item that was fetched, and that nobody looked at."""
+        with self._changed:
+            self.num_skipped += 1
 
     def close(self, error: BaseException | None = None) -> None:
         """Says that nothing more comes.

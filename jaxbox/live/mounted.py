@@ -43,6 +43,7 @@ class MountedSource:
         Raises:
           InputError: where the first sweeps show no ground.
         """
+        is_moved = any(self._position)
         mounting = None if self._level else Mounting(self._position)
         first: list[LiveSweep] = []
         for came in self._source:
@@ -56,8 +57,10 @@ class MountedSource:
                     # It asks a sweep for no more than its name and points.
                     mounting = io.measure_sweeps(first, position=self._position)  # pyright: ignore[reportArgumentType]
                     self._report(mounting)
+                    is_moved = True
+                    first.clear()
             else:
-                yield _moved(item, mounting.level)
+                yield _moved(item, mounting.level) if is_moved else item
 
 
 def _moved(sweep: LiveSweep, move: Callable[[np.ndarray], np.ndarray]) -> LiveSweep:

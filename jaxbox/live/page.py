@@ -55,10 +55,12 @@ def open_page(
             if not thread.is_alive():
                 thread.start()
 
-        yield show, page_url(server)
-        viewer.stop()
-        if thread.is_alive():
-            thread.join()
+        try:
+            yield show, page_url(server)
+        finally:
+            viewer.stop()
+            if thread.is_alive():
+                thread.join()
     finally:
         with quiet():
             server.stop()
@@ -85,8 +87,13 @@ class _Newest(Session):
         del index
         self._drawn = self._came
         live, _ = self.drawn
+        assert live.found.detections is not None
         frame = Frame.of_points(
-            live.sweep.name, *live.sweep.read_points(), timestamp_ns=live.sweep.timestamp_ns
+            live.sweep.name,
+            *live.sweep.read_points(),
+            timestamp_ns=live.sweep.timestamp_ns,
+            # The same rows as what was found in them.
+            capacity=live.found.detections.ground_mask.shape[-1],
         )
         told = f"{live.num_skipped} of {live.sweep.frame + 1} sweeps were skipped, as newer ones had come."
         return dataclasses.replace(frame, problems=(told,) if live.num_skipped else ())

@@ -54,7 +54,7 @@ class Reception:
 
     def pass_over(self) -> None:
         """Counts a sweep that was taken, and came too late to be looked at."""
-        self._mailbox.num_skipped += 1
+        self._mailbox.skip()
 
     def sweeps(self, timeout_s: float) -> Generator[LiveSweep, None, None]:
         """The newest sweep each time, as long as the source goes on.

@@ -90,7 +90,7 @@ class VelodyneSource:
 
     def __iter__(self) -> Iterator[LiveSweep | Fault | None]:
         """A sweep with the packet that ends its turn, and None with the others."""
-        sender, frame, num_lost = self._address.sender, 0, None
+        sender, frame, num_lost, heard_ns = self._address.sender, 0, None, 0
         with self._socket:
             _drain(self._socket)
             while True:
@@ -107,6 +107,10 @@ class VelodyneSource:
                         f"{self.name}: {lost - num_lost} packets were lost; this machine is too busy."
                     )
                 num_lost = lost
+                if sender not in (None, host) and stamp_ns - heard_ns > IDLE_S * _NS_PER_S:
+                    # It has fallen silent, while another one sends.
+                    self._turns.reset()
+                    sender = self._address.sender
                 if sender not in (None, host):
                     yield Fault(f"{self.name}: a packet from {host}, while {sender} is listened to.")
                     continue
@@ -115,7 +119,7 @@ class VelodyneSource:
                 except InputError as error:
                     yield Fault(f"{self.name}: {error} It came from {host}.")
                     continue
-                sender = host
+                sender, heard_ns = host, stamp_ns
                 yield None if turn is None else _sweep(*turn, frame)
                 frame += turn is not None
 
