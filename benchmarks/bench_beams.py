@@ -92,9 +92,9 @@ def measure_synthetic(
         keep = thin_beams(sweep.xyz, num_beams=DENSEST, keep_every=DENSEST // num_beams)
         answer = common.detect(sweep.xyz[keep], sweep.intensity[keep], config)
         acted_on = np.asarray(answer.valid) & (np.asarray(answer.score) >= DEFAULT_SCORE_THRESHOLD)
-        rows = np.column_stack([answer.center, answer.size, answer.yaw]).astype(float)[acted_on]
+        rows = common.box_rows(answer)[acted_on]
         boxes = sweep.boxes
-        truth = np.column_stack([boxes.center, boxes.size, boxes.yaw])
+        truth = common.box_rows(boxes)
         overlap, _ = pairwise_overlaps(truth, rows)
         is_wanted = (boxes.num_points >= SYNTHETIC_MIN_POINTS) & (boxes.label == Label.CAR)
         matched = matching.match(overlap, is_wanted, min_overlap=SYNTHETIC_OVERLAP)

@@ -91,15 +91,17 @@ def test_the_summary_has_the_figures_that_the_limits_are_for(street):
 FIGURES = ("far_points", "scattered_azimuths", "near_ground_points", "rough_points", "points_under")
 
 
-@pytest.mark.parametrize("kind", ["clear", "snow", "from below"])
+@pytest.mark.parametrize("kind", ["clear", "snow", "from below", "from a mast"])
 def test_the_reference_counts_the_same(street, kind):
     xyz = spoiled(street, "snow", 0.1) if kind == "snow" else street
     # Turned, as the beams of the street lie on the edges of azimuth cells.
     cos, sin = np.cos(0.001), np.sin(0.001)
     xyz = xyz @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
-    xyz = (xyz + np.array([0, 0, 1.0 if kind == "from below" else 0.0])).astype(np.float32)
+    up_m = {"from below": 1.0, "from a mast": -8.0}.get(kind, 0.0)
+    xyz = (xyz + np.array([0, 0, up_m])).astype(np.float32)
     ours, theirs = answer(xyz).counts, reference.detect(xyz).counts
     for name in FIGURES:
         # Planes differ in their last digits, and with them what lies on a border.
         assert int(getattr(ours, name)) == pytest.approx(theirs[name], rel=0.001, abs=1), name
     assert int(ours.far_points) > 0
+    assert (int(ours.points_under) > 0) == (kind == "from a mast")

@@ -154,6 +154,6 @@ def test_what_the_encoder_refuses_is_an_error_and_no_file(tmp_path, monkeypatch)
         with open_gif(tmp_path / "a.gif", rate_hz=10) as add:
             add(np.zeros((10, 10, 3), np.uint8))
 
-    with pytest.raises(OSError, match=r"a\.gif|jaxbox"):
+    with pytest.raises(OSError, match="ffmpeg ended with code .*max_colors"):
         write()
     assert list(tmp_path.iterdir()) == []
