@@ -166,8 +166,9 @@ def endure(source: str, minutes: float) -> dict[str, Any]:
                     process.check()
                     samples.append(_sample(process, len(samples)))
                     print(samples[-1], flush=True)
-            stops += 1
-            time.sleep(SILENT_S)
+            if time.monotonic() < end_s:
+                stops += 1
+                time.sleep(SILENT_S)
     memory = np.array([sample["resident_mb"] for sample in samples])
     settled = slice(int(SETTLED_SHARE * len(memory)), None)
     slope = np.polyfit(np.arange(len(memory))[settled], memory[settled], 1)[0] if len(memory) > 4 else 0.0

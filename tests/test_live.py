@@ -223,7 +223,7 @@ def test_what_a_sensor_sends_while_all_is_compiled_is_skipped(compiled):
 
 
 def test_larger_sweeps_are_reported_once(compiled):
-    _, results, told = run_live([sweep(0, count=99), 0.1, sweep(1, count=99), 0.1], capacity=64)
+    _, results, told = run_live([sweep(0, count=99), 0.5, sweep(1, count=99), 0.1], capacity=64)
     assert len(results) == 2
     assert [
         sentence for sentence in told if "99 points" in sentence and "--capacity 16384" in sentence
@@ -262,7 +262,7 @@ def test_a_run_that_is_left_ends_its_thread(compiled):
 
 
 def test_other_settings_are_used_from_the_next_sweep_on(compiled):
-    run = LiveRun(FakeSource([sweep(0), 0.1, sweep(1)]), capacity=64)
+    run = LiveRun(FakeSource([sweep(0), 0.5, sweep(1)]), capacity=64)
     seen = []
     for _ in run:
         run.use("other")

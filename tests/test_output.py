@@ -154,6 +154,20 @@ def test_what_the_encoder_refuses_is_an_error_and_no_file(tmp_path, monkeypatch)
         with open_gif(tmp_path / "a.gif", rate_hz=10) as add:
             add(np.zeros((10, 10, 3), np.uint8))
 
-    with pytest.raises(OSError, match="ffmpeg ended with code .*max_colors"):
+    with pytest.raises(OSError, match=r"ffmpeg ended with code .*max_colors"):
+        write()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_encoder_that_ends_early_is_an_error_that_names_the_film(tmp_path):
+    pytest.importorskip("imageio_ffmpeg")
+
+    def write():
+        # It refuses no pictures a second, and its input breaks while pictures come.
+        with open_video(tmp_path / "film.mp4", rate_hz=0.0) as add:
+            for _ in range(100):
+                add(np.zeros((400, 600, 3), np.uint8))
+
+    with pytest.raises(OSError, match=r"film\.mp4: ffmpeg ended with code"):
         write()
     assert list(tmp_path.iterdir()) == []

@@ -12,7 +12,7 @@ from jaxbox.viewer.frames import Frame
 from jaxbox.viewer.motion import motion_lines, shown_groups
 from jaxbox.viewer.space import Caption, Lines, colored_edges, edges
 from jaxbox.viz import BoxGroup, BoxSet, color_by_height, color_by_id, draw_image_boxes
-from jaxbox.viz.boxes import bird_eye_iou, find_matches
+from jaxbox.viz.boxes import pair_boxes
 from jaxbox.viz.colors import ESTIMATE, HULL, IGNORED, TRUTH, Color, shade_by_height
 from jaxbox.viz.stages import height_above_plane
 
@@ -132,7 +132,9 @@ def build_scene(
         **motion,
     }
     boxes = _joined(groups)
-    captions = _all_captions(boxes if view.boxes else _no_boxes(), vehicles, others, below=compared)
+    captions = []
+    if view.captions:
+        captions = _all_captions(boxes if view.boxes else _no_boxes(), vehicles, others, below=compared)
     titles = [Caption(text=title, position=(0.0, 0.0, _TITLE_M))] if title and view.apart_m else []
     return Scene(
         points=frame.xyz,
@@ -141,7 +143,7 @@ def build_scene(
             name: Lines(segments=drawn.segments, color=on_page(drawn.color, view))
             for name, drawn in lines.items()
         },
-        captions=(*(captions if view.captions else ()), *titles),
+        captions=(*captions, *titles),
         image=_camera_picture(frame, shown, vehicles, others),
         boxes=boxes,
         view=view,
@@ -208,15 +210,14 @@ def _ring(polygon: np.ndarray, z: float) -> np.ndarray:
 
 def _all_captions(boxes: BoxSet, vehicles: BoxSet, others: BoxSet, *, below: bool) -> list[Caption]:
     """One an object: a label in the place of a box is in that box's caption, where it says anything else."""
-    (hit, found), iou = find_matches(boxes, vehicles), bird_eye_iou(boxes, vehicles)
-    texts = list(boxes.captions)
-    for row in np.flatnonzero(hit).tolist():
-        label, word = vehicles.captions[iou[row].argmax()], texts[row].split()[0]
+    pairs, texts = pair_boxes(boxes, vehicles), list(boxes.captions)
+    for row in np.flatnonzero(pairs >= 0).tolist():
+        label, word = vehicles.captions[pairs[row]], texts[row].split()[0]
         # A track's caption begins with its id.
         if word.isalpha() and label.lower() != word:
             texts[row] += f" (label: {label})"
     captions = _captions(dataclasses.replace(boxes, captions=tuple(texts)), below=below)
-    alone = [vehicles.take(~found), others]
+    alone = [vehicles.take(~np.isin(np.arange(len(vehicles)), pairs)), others]
     return captions + [
         dataclasses.replace(caption, text=f"label: {caption.text}")
         for labels in alone

@@ -148,14 +148,29 @@ def find_matches(boxes: BoxSet, truth: BoxSet) -> tuple[np.ndarray, np.ndarray]:
     Returns:
       (K,) bool: the estimate has found a true box; (L,) bool: the true box was found.
     """
+    pairs = pair_boxes(boxes, truth)
+    return pairs >= 0, np.isin(np.arange(len(truth)), pairs)
+
+
+def pair_boxes(boxes: BoxSet, truth: BoxSet) -> np.ndarray:
+    """As `find_matches`, which true box each estimate has found.
+
+    Args:
+      boxes: K estimates.
+      truth: L true boxes.
+
+    Returns:
+      (K,) int: its row; -1 for an estimate that has found none.
+    """
     iou = bird_eye_iou(boxes, truth)
-    hit, found = np.zeros(len(boxes), bool), np.zeros(len(truth), bool)
+    pairs, free = np.full(len(boxes), -1), np.ones(len(truth), bool)
     order = np.arange(len(boxes)) if boxes.rank is None else np.argsort(-boxes.rank, kind="stable")
     for row in order:
-        free = np.where(found, 0.0, iou[row])
-        if len(free) and free.max() >= MATCH_IOU:
-            hit[row] = found[free.argmax()] = True
-    return hit, found
+        left = np.where(free, iou[row], 0.0)
+        if len(left) and left.max() >= MATCH_IOU:
+            pairs[row] = left.argmax()
+            free[pairs[row]] = False
+    return pairs
 
 
 _Rectangle = tuple[tuple[float, float], tuple[float, float], float]

@@ -73,8 +73,9 @@ def open_gif(path: str | os.PathLike[str], *, rate_hz: float) -> Iterator[AddPic
         yield write
 
 
-_Begin = Callable[[pathlib.Path, tuple[int, int], float, contextlib.ExitStack], AddPicture]
-"""Begins a file of a size (height, width, px) and rate; the stack ends it."""
+_Begin = Callable[[pathlib.Path, str, tuple[int, int], float, contextlib.ExitStack], AddPicture]
+"""Begins a file, which errors call by another name, of a size (height, width, px) and rate; the stack ends
+it."""
 
 
 @contextlib.contextmanager
@@ -90,47 +91,47 @@ def _open(
                 height, width = picture.shape[:2]
                 size = (height // block_px * block_px, width // block_px * block_px)
                 temporary = stack.enter_context(atomic_path(path)).resolve()
-                add = begin(temporary, size, rate_hz, stack)
+                add = begin(temporary, str(path), size, rate_hz, stack)
             add(np.ascontiguousarray(_fit(picture, size)))
 
         yield write
 
 
 def _begin_mpeg4(
-    path: pathlib.Path, size: tuple[int, int], rate_hz: float, stack: contextlib.ExitStack
+    path: pathlib.Path, where: str, size: tuple[int, int], rate_hz: float, stack: contextlib.ExitStack
 ) -> AddPicture:
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODEC), rate_hz, size[::-1])
     stack.callback(writer.release)
     if not writer.isOpened():
-        raise OSError(f"{path}: OpenCV cannot write a video there ({CODEC}).")
+        raise OSError(f"{where}: OpenCV cannot write a video there ({CODEC}).")
     return lambda picture: writer.write(picture[..., ::-1].copy())
 
 
 def _begin_h264(
-    path: pathlib.Path, size: tuple[int, int], rate_hz: float, stack: contextlib.ExitStack
+    path: pathlib.Path, where: str, size: tuple[int, int], rate_hz: float, stack: contextlib.ExitStack
 ) -> AddPicture:
     # The index comes first, so that a browser begins before it has the whole file.
     options = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
-    return stack.enter_context(_ffmpeg(path, size, rate_hz, options))
+    return stack.enter_context(_ffmpeg(path, where, size, rate_hz, options))
 
 
 def _begin_gif(
-    path: pathlib.Path, size: tuple[int, int], rate_hz: float, stack: contextlib.ExitStack
+    path: pathlib.Path, where: str, size: tuple[int, int], rate_hz: float, stack: contextlib.ExitStack
 ) -> AddPicture:
     palette = f"split[a][b];[a]palettegen=max_colors={GIF_COLORS}[p];[b][p]paletteuse=dither=none"
-    return stack.enter_context(_ffmpeg(path, size, rate_hz, ["-vf", palette]))
+    return stack.enter_context(_ffmpeg(path, where, size, rate_hz, ["-vf", palette]))
 
 
 @contextlib.contextmanager
 def _ffmpeg(
-    path: pathlib.Path, size: tuple[int, int], rate_hz: float, options: Sequence[str]
+    path: pathlib.Path, where: str, size: tuple[int, int], rate_hz: float, options: Sequence[str]
 ) -> Iterator[AddPicture]:
     """Runs ffmpeg, which takes pictures from its input."""
     try:
         program = require(_ENCODER, extra=_EXTRA, what="H.264 videos").get_ffmpeg_exe()
     # Its wheels for some platforms hold none.
     except RuntimeError as error:
-        raise OSError(f"{path}: {error}") from error
+        raise OSError(f"{where}: {error}") from error
     pictures = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[1]}x{size[0]}", "-r", f"{rate_hz:.6f}"]
     command = [program, "-y", "-v", "error", *pictures, "-i", "-", *options, str(path)]
     with tempfile.TemporaryFile() as errors:
@@ -139,9 +140,13 @@ def _ffmpeg(
             command, stdin=subprocess.PIPE, stdout=errors, stderr=errors, start_new_session=True
         )
         assert process.stdin is not None
+        broken = None
         try:
             yield process.stdin.write
             process.stdin.close()
+        except BrokenPipeError as error:
+            # It has ended, and says why.
+            broken = error
         except BaseException:
             process.kill()
             raise
@@ -149,10 +154,10 @@ def _ffmpeg(
             with contextlib.suppress(OSError):
                 process.stdin.close()
             code = process.wait()
-        if code:
+        if code or broken is not None:
             errors.seek(0)
             text = errors.read(_MAX_REASON).decode(errors="replace").strip()
-            raise OSError(f"{path}: ffmpeg ended with code {code} ({text}).")
+            raise OSError(f"{where}: ffmpeg ended with code {code} ({text}).") from broken
 
 
 def _fit(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
