@@ -73,6 +73,7 @@ ABLATIONS = (
     }),
     Ablation("no second reading along the scene", {"completion.along_scene": False}),
     Ablation("sides of the class's size, not the likely one", {"completion.seen_weight": 0.0}),
+    Ablation("far ends as fitted, not where the last point is", {"completion.end_points": NO_LIMIT}),
     Ablation("no lowest box height", {"vehicles.classes.0.min_box_height_m": 0.0}),
     # Score.
     Ablation("no free length, no objective in the score", {

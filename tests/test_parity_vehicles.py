@@ -11,7 +11,7 @@ import pytest
 
 from jaxbox import reference
 from jaxbox.geometry import planar
-from jaxbox.stages import scoring
+from jaxbox.stages import _surroundings, scoring
 from jaxbox.stages.state import Obstacles
 from jaxbox.xla import backend
 
@@ -27,7 +27,7 @@ def count_points_around(boxes, tops, recess, past_ends, sure, num_boxes, xy, hei
     prior = dataclasses.replace(SETTINGS.classes[0], **fields)
     obstacles = Obstacles(jnp.arange(len(xy)), xy, height, jnp.int32(num_points), len(xy))
     region = parity.CONFIG.region
-    return scoring.count_points_around(boxes, prior, sure, num_boxes, obstacles, SETTINGS, region)
+    return _surroundings.count_points_around(boxes, prior, sure, num_boxes, obstacles, SETTINGS, region)
 
 
 non_max_suppression = parity.PerForm(scoring.non_max_suppression)
@@ -81,27 +81,36 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
             len(xy),
         )
         around = parity.on_host(around)
-        wrong, seen, tops_m = 0, 0, []
+        wrong, seen, tops_m, depths_m = 0, 0, [], []
         for row, expected in enumerate(counted):
             theirs = np.array([getattr(expected, name) for name in COUNTS])
             ours = np.array([getattr(around, name)[row] for name in COUNTS])
             wrong, seen = wrong + np.abs(ours - theirs).sum(), seen + theirs.sum()
             tops_m.append((around.top[row], expected.top))
+            depths_m.append((around.deepest[row], expected.deepest))
         # A point on the edge of a box may round to either side of it.
         parity.assert_share(wrong, seen, 1e-4, "points round boxes")
         # A height on the edge of a level may round to either side of it.
         ours_m, theirs_m = np.transpose(tops_m)
         off = np.abs(ours_m - theirs_m) > 1e-4
         parity.assert_share(off.sum(), len(off), 0.02, "tops")
+        off = np.abs(np.diff(depths_m, axis=1)) > 1e-4
+        parity.assert_share(off.sum(), len(off), 0.02, "farthest points")
 
 
 @jax.jit
 def score_boxes(columns, prior):
-    around = scoring.NeighbourhoodCounts(jnp.stack(columns["around"], axis=1))
+    around = _surroundings.NeighbourhoodCounts(jnp.stack(columns["around"], axis=1))
     seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "objective"))
     early = scoring.evidence_score(*seen, SETTINGS)
     late = scoring.neighbourhood_score(around, columns["rho"], prior, SETTINGS)
     return early * scoring.size_score(columns["length"], columns["width"], prior) * late * prior.prior_weight
+
+
+@jax.jit
+def end_where_seen(boxes, columns, usual_m):
+    around = _surroundings.NeighbourhoodCounts(columns)
+    return scoring.end_where_seen(boxes, around, usual_m, parity.CONFIG.completion, 0.004)
 
 
 def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
@@ -124,6 +133,7 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
             rng.integers(0, 20, MAX_BOXES),
             upper := rng.integers(0, 20, MAX_BOXES),
             rng.integers(0, upper + 1),
+            rng.uniform(0, 5, MAX_BOXES),
         ],
     }
     columns, prior = jax.tree.map(np.float32, (columns, prior))
@@ -148,6 +158,31 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
     np.testing.assert_allclose(scores, expected, rtol=2e-4, atol=1e-7)
     assert (expected == 0).sum() > 50
     assert (expected > 0.05).sum() > 50
+
+
+def test_far_ends_are_where_the_reference_sees_them():
+    rng = np.random.default_rng(0)
+    usual_m = rng.choice([3.9, 4.98, 8.5], MAX_BOXES)
+    size = np.column_stack([usual_m * rng.uniform(0.8, 1.3, MAX_BOXES), rng.uniform(1, 2.5, MAX_BOXES)])
+    place = rng.uniform([-60, -60], 60, (MAX_BOXES, 2)) * rng.choice([0.02, 0.2, 1], (MAX_BOXES, 1))
+    boxes = np.column_stack([place, size, rng.uniform(-4, 4, MAX_BOXES)]).astype(np.float32)
+    columns = np.zeros((MAX_BOXES, 7), np.float32)
+    columns[:, 0], columns[:, 6] = rng.integers(0, 500, MAX_BOXES), size[:, 0] * rng.uniform(0, 1, MAX_BOXES)
+    rule, beam_angle = parity.CONFIG.completion, 0.004
+    ours = end_where_seen(boxes, columns, usual_m.astype(np.float32))
+    expected = [
+        reference.end_where_seen(
+            box,
+            reference.NeighbourhoodCounts(columns[row, 0], 1.5, 0, 0, deepest=float(columns[row, 6])),
+            usual_m[row],
+            rule,
+            beam_angle,
+        )
+        for row, box in enumerate(boxes.astype(float))
+    ]
+    np.testing.assert_allclose(ours, expected, atol=1e-4)
+    moved = np.abs(np.array(expected) - boxes)[:, 2] > 1e-3
+    assert 50 < moved.sum() < MAX_BOXES / 2
 
 
 def test_overlap_of_boxes_is_that_of_opencv(cases):
@@ -240,5 +275,5 @@ def test_points_round_crowded_boxes_are_the_same_in_both_forms(num_boxes, num_po
     rows, others = cpu.rows[:num_boxes], other.rows[:num_boxes]
     whole = [0, 2, 3, 4, 5]
     np.testing.assert_array_equal(rows[:, whole], others[:, whole])
-    np.testing.assert_allclose(rows[:, 1], others[:, 1], atol=1e-6)
+    np.testing.assert_allclose(rows[:, [1, 6]], others[:, [1, 6]], atol=1e-5)
     assert (rows[:, 0].sum() > 0) == (num_boxes > 1 and num_points > 0)

@@ -738,6 +738,47 @@ def test_upper_points_behind_the_faces_are_recessed():
     assert (around.num_upper, around.num_recessed) == (4, 2)
 
 
+CORNERS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
+
+
+def test_the_far_end_of_a_side_that_is_seen_is_at_its_last_point_and_a_hidden_one_stays():
+    rule = dataclasses.replace(COMPLETION, seen_length=0.6, end_slope=0.2, end_points=50.0)
+    around = reference.NeighbourhoodCounts(num_inside=150, top=1.5, num_above=0, num_ring=0, deepest=3.2)
+
+    def length(box, **changes):
+        seen = dataclasses.replace(around, **changes)
+        answered = reference.end_where_seen(np.array(box), seen, 3.9, rule, 0.004)
+        nearest = [
+            np.linalg.norm(turned(each[2:4] / 2 * CORNERS, each[4]) + each[:2], axis=1).min()
+            for each in (answered, np.array(box))
+        ]
+        assert nearest[0] == pytest.approx(nearest[1])
+        np.testing.assert_array_equal(answered[3:], box[3:])
+        return answered[2]
+
+    aside, ahead = [10.0, 5.0, 3.9, 1.6, 0.0], [15.0, 0.0, 3.9, 1.6, 0.0]
+    # The nearest corner is 8.05 m ahead and 4.2 m aside, so that beams are .079 m apart on the side.
+    spacing_m = 0.004 * (8.05**2 + 4.2**2) / 4.2
+    assert length(aside) == pytest.approx(3.9 + 0.75 * (3.2 + spacing_m / 2 - 3.9))
+    assert length(aside, num_inside=50) == pytest.approx(3.9 + 0.5 * (3.2 + spacing_m / 2 - 3.9))
+    assert length(aside, deepest=2.3) == 3.9
+    assert length(ahead) == 3.9
+    assert length([*aside[:4], np.pi]) == pytest.approx(length(aside))
+    assert length([-10.0, *aside[1:]]) == pytest.approx(length(aside))
+    assert 3.9 > length([15.0, 1.5, 3.9, 1.6, 0.0]) > length(aside)
+
+
+def test_the_farthest_point_counts_from_the_near_end_and_behind_hidden_faces_too():
+    box = np.array([10.0, 5.0, 4.0, 2.0, 0.0])
+    xyz = np.array([[8.1, 4.1, 0], [12.05, 4.5, 0], [12.2, 4.5, 0], [9.0, 5.0, 0]])
+    height = np.array([1.0, 1.0, 1.0, 2.5])
+    for sure, deepest in ((0.0, 4.05), (1.0, 4.05)):
+        around = reference.count_points_around(box, LOW_CAR, obstacles_of(xyz, height), AROUND, sure=sure)
+        assert around.deepest == pytest.approx(deepest)
+    nothing = reference.count_points_around(box, LOW_CAR, obstacles_of(xyz[2:], height[2:]), AROUND)
+    assert nothing.deepest == 0
+
+
 def test_a_few_stray_returns_above_a_roof_are_not_its_top():
     roof = np.random.default_rng(0).uniform(0.3, 1.5, 400)
     options = {"max_height_m": 2.2, "top_quantile": 0.01}

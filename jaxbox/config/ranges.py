@@ -53,7 +53,7 @@ _SIGNED = """
 _POSITIVE = """
     filtering.bandwidth_m filtering.num_std
     ground.tolerance_m ground.smoothing_m ground.max_height_m
-    clustering.max_extent_m
+    clustering.max_extent_m completion.end_slope completion.end_points
     evidence.hit_max_height_m evidence.free_max_height_m evidence.support_height_m
     box.slab_max_height_m box.min_distance_m box.direction_sigma_deg
     vehicles.classes.length_m vehicles.classes.width_m vehicles.classes.height_m

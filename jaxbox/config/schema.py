@@ -257,7 +257,7 @@ class CompletionConfig:
     along_scene: bool = _static(default=True)
     """static: let the evidence also judge the rectangle along the scene's direction, where that is not
     the best rotation by itself; needs ``box.scene_direction``."""
-    seen_length: Scalar = 0.72
+    seen_length: Scalar = 0.67
     """A side measured at least this long, as a fraction of the class's length, may be seen whole."""
     seen_width: Scalar = 0.83
     """As ``seen_length``, for the width."""
@@ -267,6 +267,11 @@ class CompletionConfig:
     """Lengths read short by this: bumpers are round, and the far one is seen last."""
     width_margin_m: Scalar = 0.06
     """Widths read short by this."""
+    end_slope: Scalar = 0.25
+    """Slope of the beams against the long side from which on the farthest point inside the box tells where
+    its length ends."""
+    end_points: Scalar = 50.0
+    """Points inside the box at which that weighs half."""
     max_assignments: int = _static(default=4096)
     """static: capacity for sides of rectangles that the evidence weighs as the length of a class."""
     num_rays: int = _static(default=32)

@@ -1,12 +1,13 @@
 """Vehicle decision: the score of a box, what surrounds it, and non-maximum suppression."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from scipy.special import expit
 
-from jaxbox.config import ClassPrior, DetectorConfig, Scalar, VehicleConfig
+from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, Scalar, VehicleConfig
 from jaxbox.reference.state import (
     Candidate,
     ClassHypothesis,
@@ -27,6 +28,10 @@ SIDE_DEPTHS_M = -0.15, 0.35
 """Points at these depths behind the long side that the sensor sees lie along it."""
 LOWEST_LEVEL = 0.4
 """Where the levels begin, as a share of the highest that points of the vehicle may have."""
+SEEN_RAMP = 0.05
+"""Share of the class's length over which a box goes from partly hidden to seen whole."""
+MAX_END_MARGIN_M = 0.4
+"""An end lies no farther beyond the last point than this."""
 
 
 def score_boxes(
@@ -66,6 +71,10 @@ def score_boxes(
         around = _look_around(box.box, prior, cluster, early, obstacles, config.vehicles)
         rho = float(np.hypot(box.box[0], box.box[1]))
         score = early * neighbourhood_score(around, rho, prior, config.vehicles)
+        if config.vehicles.neighbourhood and config.completion.mode != "none":
+            beam_angle = 2 * np.pi / config.evidence.num_azimuths
+            seen = end_where_seen(box.box, around, float(prior.length_m), config.completion, beam_angle)
+            box = dataclasses.replace(box, box=seen)
         return Candidate(hypothesis, box, around, score)
 
     pairs = zip(completed.hypotheses, completed.boxes, strict=True)
@@ -147,6 +156,7 @@ def count_points_around(
     reach_m = np.hypot(longer[2], longer[3]) / 2 + 2 * config.ring_m
     near = obstacles.tree.query_ball_point(box[:2], reach_m)
     xy, height = obstacles.xyz[near, :2], obstacles.height[near]
+    body = xy[(distance_outside(xy, box) < config.margin_m) & (height < prior.count_max_height_m)]
     counted = ~is_behind(xy, box, config.ring_m - (config.ring_m + config.margin_m) * sure)
     xy, height = xy[counted], height[counted]
     outside = distance_outside(xy, box)
@@ -161,6 +171,7 @@ def count_points_around(
         num_ring=int((~within & (distance_outside(xy, longer) < config.ring_m) & counted).sum()),
         num_upper=int(upper.sum()),
         num_recessed=int((upper & (depth_behind_faces(xy, box) > prior.recess_m)).sum()),
+        deepest=float(np.max(depth_behind_end(body, box), initial=0.0)),
     )
 
 
@@ -240,6 +251,57 @@ def depth_behind_faces(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
         if abs(sensor[axis]) > half:
             depth = np.minimum(depth, half - np.sign(sensor[axis]) * local[:, axis])
     return depth
+
+
+def depth_behind_end(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """How far points lie behind the end of a box that is nearer to a sensor at the origin, along the box.
+
+    Args:
+      xy: (n, 2) m.
+      box: (5,): x, y, length, width in m and yaw in rad.
+
+    Returns:
+      (n,) m, negative before that end.
+
+    >>> depth_behind_end(np.array([[9.0, 0.3]]), np.array([10.0, 0, 4, 2, np.pi])).round(6).tolist()
+    [1.0]
+    """
+    facing = np.sign(_in_box_frame(np.zeros(2), box)[0])
+    return box[2] / 2 - facing * _in_box_frame(xy, box)[:, 0]
+
+
+def end_where_seen(
+    box: np.ndarray,
+    around: NeighbourhoodCounts,
+    usual_m: float,
+    config: CompletionConfig,
+    beam_angle: float,
+) -> np.ndarray:
+    """Moves the far end of a box to where all points inside say that it is, as far as the sensor sees it.
+
+    Args:
+      box: (5,): x, y, length, width in m and yaw in rad.
+      around: all points inside; the farthest tells where the end is.
+      usual_m: length of the class.
+      config: `seen_length` of the class's length is the least that shows an end; from `end_slope` on beams
+        show it for sure, and `end_points` points half so.
+      beam_angle: rad, between neighbouring beams.
+
+    Returns:
+      (5,) the box with the same near end.
+    """
+    sensor = _in_box_frame(np.zeros(2), box)
+    along, across = np.maximum(np.abs(sensor) - box[2:4] / 2, 0)
+    view = np.arctan2(across, along)
+    weight = min(np.tan(min(view, 1.5)) / float(config.end_slope), 1.0)
+    weight *= np.interp(around.deepest / usual_m - float(config.seen_length), [0, SEEN_RAMP], [0, 1])
+    weight *= around.num_inside / (around.num_inside + float(config.end_points))
+    # Beams that meet the side at that angle, so far away, are so far apart on it.
+    spacing_m = beam_angle * np.hypot(along, across) / np.sin(view) if view > 0 else np.inf
+    length = box[2] + weight * (around.deepest + min(spacing_m / 2, MAX_END_MARGIN_M) - box[2])
+    near_end = box[:2] + np.sign(sensor[0]) * box[2] / 2 * np.array([np.cos(box[4]), np.sin(box[4])])
+    center = near_end - np.sign(sensor[0]) * length / 2 * np.array([np.cos(box[4]), np.sin(box[4])])
+    return np.array([*center, length, *box[3:]])
 
 
 def _in_box_frame(xy: np.ndarray, box: np.ndarray) -> np.ndarray:

@@ -194,6 +194,9 @@ class NeighbourhoodCounts:
     """Points inside as high as glass, bonnet and roof."""
     num_recessed: float = 0
     """Those of them behind the faces that the sensor sees."""
+    deepest: float = 0
+    """m: how far behind the near end the farthest point of the vehicle's heights within the box and its
+    margin lies, those behind hidden faces too."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,16 +2,17 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import chex
 import jax
 import jax.numpy as jnp
 
-from jaxbox.config import ClassPrior, DetectorConfig, RegionConfig, VehicleConfig
+from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, VehicleConfig
 from jaxbox.geometry.planar import rectangle_iou, wrap_yaw
+from jaxbox.stages._assignments import SEEN_RAMP
 from jaxbox.stages._priors import asymmetric_gaussian, prior_of, size_score
+from jaxbox.stages._surroundings import NeighbourhoodCounts, cluster_alone, count_points_around
 from jaxbox.stages.state import (
     NOT_A_BOX,
     Boxes,
@@ -23,84 +24,22 @@ from jaxbox.stages.state import (
     Obstacles,
     RayFractions,
 )
-from jaxbox.xla import chunks
 from jaxbox.xla.loops import map_rows
-from jaxbox.xla.rows import compact, sum_after, take
-from jaxbox.xla.runs import count_kinds, fold_runs, maximum_nonnegative
-from jaxbox.xla.sorting import best_first, select_highest, sort_by_group
+from jaxbox.xla.rows import compact, take
+from jaxbox.xla.sorting import best_first, select_highest
 from jaxbox.xla.suppression import suppress_conflicts
-
-NEARBY_CELL_M = 1.0
-"""Points are looked up by cells of this size."""
-
-
-MAX_CELL_ROWS = 24
-"""Rows of cells round a box: a vehicle of 18 m, the longest that passes the gates, with its ring."""
-
-
-NUM_KINDS = 5
-"""Kinds of points that are counted, see `NeighbourhoodCounts`."""
-
-
-NUM_LEVELS = 20
-"""Levels of height in which the points inside are counted, up to the highest that a vehicle's may have."""
-
-
-LOWEST_LEVEL = 0.4
-"""Where the levels begin, as a share of that height: no vehicle's top is lower."""
-
 
 PSEUDO_COUNT = 5
 """Upper points that are added before the share behind the faces is taken, at the share of the full score, so
 that a few points cannot give an extreme share."""
 
 
-SIDE_DEPTH_M, SIDE_HALF_M = 0.1, 0.25
-"""Points beyond the far end whose depth behind the long side that the sensor sees is the first, give or take
-the second, go on along that side: they are of what the box holds a part of."""
-
-
 INSIDE_TOLERANCE_M = 1e-3
 """A point on the face of its box is inside."""
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class NeighbourhoodCounts:
-    """Points in and round each box."""
-
-    rows: jax.Array
-    """(P, 6) float32: what follows, in that order."""
-
-    @property
-    def num_inside(self) -> jax.Array:
-        """(P,) points of vehicle height inside, give or take the margin."""
-        return self.rows[:, 0]
-
-    @property
-    def top(self) -> jax.Array:
-        """(P,) m above the ground: as high as all but a few of them; 0 where there are none."""
-        return self.rows[:, 1]
-
-    @property
-    def num_above(self) -> jax.Array:
-        """(P,) points higher than the vehicle, within the box."""
-        return self.rows[:, 2]
-
-    @property
-    def num_ring(self) -> jax.Array:
-        """(P,) points of vehicle height just outside, but for those behind the box."""
-        return self.rows[:, 3]
-
-    @property
-    def num_upper(self) -> jax.Array:
-        """(P,) those inside that are as high as glass, bonnet and roof."""
-        return self.rows[:, 4]
-
-    @property
-    def num_recessed(self) -> jax.Array:
-        """(P,) those of them that lie behind the faces which the sensor sees."""
-        return self.rows[:, 5]
+MAX_END_MARGIN_M = 0.4
+"""Beams that graze a side lie farther apart, but say little of its end."""
 
 
 def score_boxes(
@@ -144,7 +83,7 @@ def score_boxes(
     around = _look_around(rectangle, label, cluster, early, num, clusters, obstacles, config)
 
     def finish(rows: tuple[Any, ...]) -> Candidates:
-        candidates = _finish(rows, clusters, settings)
+        candidates = _finish(rows, clusters, config)
         z = jnp.zeros_like(candidates.bottom) if lowest_z is None else take(lowest_z, candidates.cluster)
         place = jnp.concatenate([candidates.rectangle[:, :2], z[:, None]], axis=1)
         return dataclasses.replace(candidates, bottom=candidates.bottom + ground_elevation(place))
@@ -203,11 +142,15 @@ def _look_around(
     return count_points_around(rectangle, prior, sure, num, obstacles, config.vehicles, config.region)
 
 
-def _finish(rows: tuple[Any, ...], clusters: Clusters, config: VehicleConfig) -> Candidates:
-    """Candidates with their score and height, bottoms above the ground, in the order that they came in."""
+def _finish(rows: tuple[Any, ...], clusters: Clusters, settings: DetectorConfig) -> Candidates:
+    """Candidates with their score, length and height, bottoms above the ground, as they came in."""
     rectangle, label, cluster, score, around = rows
+    config = settings.vehicles
     prior = prior_of(config.classes, label)
     late = neighbourhood_score(around, jnp.linalg.norm(rectangle[:, :2], axis=1), prior, config)
+    if config.neighbourhood and settings.completion.mode != "none":
+        beam_angle = 2 * math.pi / settings.evidence.num_azimuths
+        rectangle = end_where_seen(rectangle, around, prior.length_m, settings.completion, beam_angle)
     height = jnp.maximum(around.top + config.top_margin_m, prior.min_box_height_m)
     bottom = jnp.zeros_like(height)
     if not config.neighbourhood:
@@ -250,174 +193,6 @@ def keep_best(candidates: Candidates, config: VehicleConfig) -> Kept:
     return Kept(*map_rows(pick, row, num_rows=num), valid=row < keep.shape[0], num=num)
 
 
-def count_points_around(
-    boxes: jax.Array,
-    prior: ClassPrior,
-    sure: jax.Array,
-    num_boxes: jax.Array,
-    obstacles: Obstacles,
-    config: VehicleConfig,
-    region: RegionConfig,
-) -> NeighbourhoodCounts:
-    """Counts the points of the whole sweep in and round each box.
-
-    Args:
-      boxes: (P, 5) float32: x, y, length, width (m), yaw (rad).
-      prior: fields of (P,) float32: points lower than `count_max_height_m` belong to the vehicle, and
-        those farther than `recess_m` behind the faces that the sensor sees are recessed; the ring reaches
-        `past_ends_m` farther past the ends.
-      sure: (P,) float32, in [0, 1]: how sure it is that the box ends where it does. Points beyond a face that
-        the sensor does not see are of another thing, and not counted: from the ring's end on where nothing is
-        sure, from the margin before the face where all is.
-      num_boxes: () int32, rows that hold a box.
-      obstacles: all points above the ground.
-      config: margin, ring, and what upper points and strays are. A `top_quantile` of 0 makes the highest
-        point the top.
-      region: that the points lie in.
-
-    Returns:
-      The counts; zero for chunks of boxes beyond `num_boxes`.
-
-    Reference: oracle `jaxbox.reference.count_points_around`.
-    """
-    halves_m, xy, ring_m = (region.half_x_m, region.half_y_m), obstacles.xy, config.ring_m
-    shape = [math.ceil(2 * half_m / NEARBY_CELL_M) for half_m in halves_m]
-
-    def cell(position: jax.Array, axis: int) -> jax.Array:
-        index = jnp.floor((position + halves_m[axis]) / NEARBY_CELL_M)
-        return jnp.clip(index, 0, shape[axis] - 1).astype(jnp.int32)
-
-    cell_of_point = cell(xy[:, 0], 0) * shape[1] + cell(xy[:, 1], 1)
-    order, begin, end = sort_by_group(
-        lambda i: i, cell_of_point, obstacles.count, shape[0] * shape[1], room=chunks.RUN_ROWS
-    )
-    points = [jnp.take(values, order, mode="clip") for values in (xy[:, 0], xy[:, 1], obstacles.height)]
-
-    def prepare(rows: tuple[jax.Array, ...]) -> tuple[jax.Array, list[jax.Array], list[jax.Array]]:
-        boxes, *others = rows
-        frames = _frames(boxes, *others)
-        reach = jnp.abs(frames[:, 2:4]) * (frames[:, 6:7] + ring_m)
-        reach = reach + jnp.abs(frames[:, 3:1:-1]) * (frames[:, 5:6] + ring_m)
-        low = [cell(boxes[:, axis] - reach[:, axis], axis) for axis in (0, 1)]
-        return frames, low, [cell(boxes[:, axis] + reach[:, axis], axis) for axis in (0, 1)]
-
-    def look(rows: tuple[jax.Array, list[jax.Array], list[jax.Array]]) -> jax.Array:
-        frames, low, high = rows
-        i = low[0][:, None] + jnp.arange(MAX_CELL_ROWS, dtype=jnp.int32)[None]
-        row = jnp.minimum(i, shape[0] - 1) * shape[1]
-        first, after = begin[row + low[1][:, None]], end[row + high[1][:, None]]
-        length = jnp.where(i <= high[0][:, None], after - first, 0)
-        counts, highest = _count_runs(frames, first, length, points, config)
-        inside, above, ring, upper, recessed = counts[:, :NUM_KINDS].T
-        top = _top(highest, config.top_quantile * inside, counts[:, NUM_KINDS:], frames[:, -1])
-        return jnp.stack([inside, top, above, ring, upper, recessed], axis=1)
-
-    behind_m = ring_m - (ring_m + config.margin_m) * sure
-    columns = boxes, prior.count_max_height_m, prior.recess_m, prior.past_ends_m, behind_m
-    rows = map_rows(prepare, columns, num_rows=num_boxes)
-    return NeighbourhoodCounts(map_rows(look, rows, num_rows=num_boxes, chunk=chunks.BOXES))
-
-
-def cluster_alone(num_points: jax.Array, top: jax.Array) -> NeighbourhoodCounts:
-    """What surrounds boxes of which only the clusters are looked at: nothing.
-
-    Args:
-      num_points: (P,) float32, of the clusters.
-      top: (P,) float32, m above the ground, of the clusters.
-
-    Returns:
-      The counts.
-    """
-    none = jnp.zeros_like(top)
-    return NeighbourhoodCounts(jnp.stack([num_points, top, none, none, none, none], axis=1))
-
-
-def _frames(
-    boxes: jax.Array,
-    count_max_height_m: jax.Array,
-    recess_m: jax.Array,
-    past_ends_m: jax.Array,
-    behind_m: jax.Array,
-) -> jax.Array:
-    """(P, 15) the frames that points round a box are compared in, see `_judge`."""
-    x, y, length, width, yaw = boxes.T
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    half_l, half_w = length / 2, width / 2
-    # The sensor at the origin, in the box's frame: it sees the faces on its side of the box.
-    sensor_u, sensor_v = -(x * cos + y * sin), x * sin - y * cos
-    sides = (sensor_u, half_l), (sensor_v, half_w)
-    near = [jnp.where(jnp.abs(sensor) > half, half - recess_m, jnp.inf) for sensor, half in sides]
-    far = [jnp.where(jnp.abs(sensor) > half, -half - behind_m, -jnp.inf) for sensor, half in sides]
-    facing = jnp.sign(sensor_u), jnp.sign(sensor_v)
-    side_v = jnp.where(jnp.abs(sensor_v) > half_w, half_w - SIDE_DEPTH_M, jnp.inf)
-    half = half_l, half_w, half_l + past_ends_m
-    columns = x, y, cos, sin, *half, *facing, *near, *far, side_v, count_max_height_m
-    return jnp.stack(columns, axis=1)
-
-
-def _count_runs(
-    frames: jax.Array,
-    first: jax.Array,
-    length: jax.Array,
-    points: Sequence[jax.Array],
-    config: VehicleConfig,
-) -> tuple[jax.Array, jax.Array]:
-    """Counts over runs of neighbouring points, some for each box, (C, runs).
-
-    Returns:
-      counts: (C, kinds + levels) float32.
-      highest: (C,) float32, m.
-    """
-
-    def update(
-        state: tuple[jax.Array, jax.Array], box: jax.Array, valid: jax.Array, columns: list[jax.Array]
-    ) -> tuple[jax.Array, jax.Array]:
-        counts, highest = _judge(frames[box], valid, columns, config)
-        return state[0].at[box].add(counts), state[1].at[box].max(highest)
-
-    num_boxes = first.shape[0]
-    none = jnp.zeros((num_boxes, NUM_KINDS + NUM_LEVELS), jnp.int32), jnp.zeros(num_boxes, jnp.float32)
-    counts, highest = fold_runs(update, none, first, length, points)
-    return counts.astype(jnp.float32), highest
-
-
-def _judge(
-    frames: jax.Array, valid: jax.Array, points: Sequence[jax.Array], config: VehicleConfig
-) -> tuple[jax.Array, jax.Array]:
-    """Counts of each kind and level of points in blocks (B, L) of them, and the highest inside (B,)."""
-    columns = [frames[:, k, None] for k in range(frames.shape[1])]
-    box_x, box_y, cos, sin, half_l, half_w, ring_half_l, facing_u, facing_v, *faces, max_height = columns
-    near_u, near_v, far_u, far_v, side_v = faces
-    x, y, height = points
-    dx, dy = x - box_x, y - box_y
-    u, v = dx * cos + dy * sin, dy * cos - dx * sin
-    toward_u, toward_v = facing_u * u, facing_v * v
-    is_along = jnp.abs(toward_v - side_v) < SIDE_HALF_M
-    is_behind = (toward_v < far_v) | (toward_u < far_u) & ~is_along
-    out_u, out_v = jnp.abs(u), jnp.where(valid & ~is_behind, jnp.abs(v) - half_w, jnp.inf)
-    inside, low = jnp.maximum(out_u - half_l, out_v) < config.margin_m, height < max_height
-    upper = inside & low & (height > config.upper_height_m)
-    recessed = upper & (toward_u < near_u) & (toward_v < near_v)
-    ring = ~inside & low & (jnp.maximum(out_u - ring_half_l, out_v) < config.ring_m)
-    kinds = inside & low, inside & ~low, ring, upper, recessed
-    share = height / max_height - LOWEST_LEVEL
-    level = jnp.minimum(share * (NUM_LEVELS / (1 - LOWEST_LEVEL)), NUM_LEVELS - 1).astype(jnp.int32)
-    level = jnp.where(inside & low & (share > 0), level, NUM_LEVELS)
-    counts = count_kinds(kinds, level, NUM_LEVELS)
-    return counts, maximum_nonnegative(jnp.where(inside & low, height, 0))
-
-
-def _top(highest: jax.Array, num_stray: jax.Array, levels: jax.Array, max_height: jax.Array) -> jax.Array:
-    """(P,) the height that that many points exceed, evenly spread within their level (P, levels)."""
-    higher = sum_after(levels)
-    num_stray = num_stray[:, None]
-    is_top = (higher <= num_stray) & (num_stray < higher + levels)
-    above = jnp.arange(NUM_LEVELS, 0, -1, dtype=jnp.float32)[None] - 1
-    above = above + (num_stray - higher) / jnp.maximum(levels, 1)
-    share = jnp.sum(jnp.where(is_top, 1 - above * ((1 - LOWEST_LEVEL) / NUM_LEVELS), 0), axis=1)
-    return jnp.where(jnp.any(is_top, axis=1), jnp.minimum(share * max_height, highest), highest)
-
-
 def evidence_score(
     num_points: jax.Array,
     hit: jax.Array,
@@ -445,6 +220,48 @@ def evidence_score(
     grounded = jnp.minimum((support + 0.5) / config.support_points, 1)
     gate = jax.nn.sigmoid((objective - config.objective_gate) / config.objective_softness)
     return dense * jnp.exp(-((free_length / config.free_scale) ** 2)) * hit * grounded * gate
+
+
+def end_where_seen(
+    rectangles: jax.Array,
+    around: NeighbourhoodCounts,
+    usual_m: jax.Array | float,
+    config: CompletionConfig,
+    beam_angle: float,
+) -> jax.Array:
+    """Moves the far end of boxes to where all points inside say that it is, as far as the sensor sees it.
+
+    The sides of a box are fitted to a sample of the points of one cluster, which seldom holds the far end:
+    few points lie there. A side's end shows where the beams meet the side at a steep angle; it lies beyond
+    the farthest point, by half the distance of two beams on the side in the mean.
+
+    Args:
+      rectangles: (P, 5) float32: x, y, length, width (m), yaw (rad).
+      around: all points inside; those as far apart as the class is long, and more, show the end.
+      usual_m: (P,) float32, of the class.
+      config: from which fraction of the class's length on a box may be seen whole, at which slope of the
+        beams against the side its end is sure, and how many points make it half so.
+      beam_angle: rad, between neighbouring beams.
+
+    Returns:
+      (P, 5) float32: the near ends stay.
+
+    Reference: oracle `jaxbox.reference.end_where_seen`.
+    """
+    x, y, length, width, yaw = rectangles.T
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    # The sensor at the origin, in the box's frame, and how far from the box along and across.
+    sensor_u, sensor_v = -(x * cos + y * sin), x * sin - y * cos
+    along = jnp.maximum(jnp.abs(sensor_u) - length / 2, 0)
+    across = jnp.maximum(jnp.abs(sensor_v) - width / 2, 0)
+    steep = jnp.minimum(across / jnp.maximum(along, 1e-3) / config.end_slope, 1)
+    whole = jnp.clip((around.deepest / usual_m - config.seen_length) / SEEN_RAMP, 0, 1)
+    dense = around.num_inside / (around.num_inside + config.end_points)
+    spacing_m = beam_angle * (along**2 + across**2) / jnp.maximum(across, 1e-3)
+    seen_m = around.deepest + jnp.minimum(spacing_m / 2, MAX_END_MARGIN_M)
+    answered = length + steep * whole * dense * (seen_m - length)
+    shift = jnp.sign(sensor_u) * (length - answered) / 2
+    return jnp.stack([x + shift * cos, y + shift * sin, answered, width, yaw], axis=1)
 
 
 def neighbourhood_score(
