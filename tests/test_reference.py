@@ -514,7 +514,7 @@ def test_without_evidence_every_ray_counts_as_hit_and_the_ground_is_not_looked_a
     completed = reference.Completed([reference.ClassHypothesis(0, Label.CAR)], [box], 1)
     config = DetectorConfig.paper()
     nothing = reference.index_obstacles(np.zeros((0, 3)), np.zeros(0), np.zeros(0, int))
-    (candidate,) = reference.score_boxes(completed, None, [cluster], nothing, config)
+    (candidate,) = reference.score_boxes(completed, None, np.array([np.inf]), [cluster], nothing, config)
     around = reference.cluster_alone(50, 1.5)
     found = {"hit": 1.0, "free_length": 0.0, "support": None}
     expected = reference.score_box(box, CAR, around=around, num_points=50, **found, config=config.vehicles)
@@ -804,6 +804,11 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     low = dataclasses.replace(around, top=1.2)
     assert score(around=low) == pytest.approx(np.exp(-((0.225 / 0.3) ** 2)))
     assert score(moved(PERFECT_BOX, x=30), around=low) == 1
+    # Or by any, where the highest beam passes there: then its height is not known.
+    assert score(around=low, reach=1.2) == score(around=dataclasses.replace(low, top=0.5), reach=0.5) == 0.7
+    assert score(around=low, reach=1.31) == score(around=low)
+    assert score(around=dataclasses.replace(low, top=0.39), reach=0.39) == 0
+    assert score(reach=1.5) == 1
 
 
 @pytest.mark.parametrize(

@@ -332,6 +332,9 @@ class VehicleConfig:
     """score x exp(-weight x ring points / points)."""
     overhead_weight: Scalar = 6.0
     """score x exp(-weight x points above / points), where those above are connected to the vehicle."""
+    cut_score: Scalar = 0.7
+    """Score of the height where the highest beam cuts a vehicle off below its usual height, so that the
+    height is not known. 0 takes the top of the points for that of the vehicle."""
     overhead_gap_m: Scalar = 0.25
     """They are connected where the gap between its top and the height from which points are above is at most
     this, and are not where it is twice this: a ceiling or a crown is no part of what stands under it."""

@@ -58,6 +58,7 @@ from jaxbox.reference.evidence import (
     first_returns,
     ground_support,
     observe,
+    steepest_beam,
     weigh_boxes,
 )
 from jaxbox.reference.filtering import (
@@ -256,6 +257,7 @@ __all__ = [
     "shape_descriptors",
     "size_score",
     "spread_points",
+    "steepest_beam",
     "surface_height",
     "top_of",
     "track_step",
