@@ -211,6 +211,25 @@ def test_envelope_keeps_a_steep_block_out_of_the_ground():
     assert height[block].min() > 0.75
 
 
+@pytest.mark.parametrize("grade", [0.1, 0.2])
+def test_a_ramp_is_ground_and_a_car_on_it_is_not(grade):
+    xy = np.random.default_rng(5).uniform(-30, 30, (60000, 2))
+    # A car with its road about it out of sight on the far side.
+    is_car = (np.abs(xy - [16, 0]) < [2, 0.8]).all(axis=1)
+    hidden = (np.abs(xy - [17, 2]) < [2, 1.2]).all(axis=1) & ~is_car
+    rise = np.maximum(xy[:, 0] - 6, 0) * grade
+    xyz = np.column_stack([xy, rise - 1.7 + np.where(is_car, 0.9, 0)])[~hidden]
+    is_car, plane = is_car[~hidden], np.array([0.0, 0.0, -1.7])
+    inner = (np.abs(xyz[:, :2]) < 17).all(axis=1) & (np.hypot(*xyz[:, :2].T) > 5)
+    for config, found in ((GROUND, 0.98), (dataclasses.replace(GROUND, sheet_tolerance_m=0.0), 0.0)):
+        grid = reference.fit_ground_surface(xyz, plane, config)
+        height = reference.height_above_ground(xyz, plane, grid, config)
+        on_ramp = inner & ~is_car & (xyz[:, 0] > 12)
+        assert (np.abs(height[on_ramp]) < config.min_height_m).mean() >= found
+        assert height[is_car].min() > 0.6
+    assert (np.abs(height[on_ramp]) < config.min_height_m).mean() < 0.5
+
+
 def test_surface_is_bilinear_between_cell_centres_and_constant_beyond_the_border():
     centers = np.arange(8) - 3.5
     grid = 2 * centers[:, None] + 3 * centers[None, :]
