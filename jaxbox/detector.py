@@ -187,7 +187,8 @@ def score_boxes(completed: Completed, segments: Segments, config: DetectorConfig
     clusters, obstacles, lowest_z = segments.clusters, segments.obstacles, None
     if config.ground.max_planes > 1:
         lowest_z = clustering.lowest_z(segments.sweep.xyz[:, 2], obstacles, clusters)
-    return scoring.score_boxes(completed, rays, clusters, obstacles, elevation, lowest_z, config)
+    steepest = None if seen is None else seen.steepest
+    return scoring.score_boxes(completed, rays, clusters, obstacles, elevation, lowest_z, steepest, config)
 
 
 def elevation_of(terrain: Ground, config: DetectorConfig) -> GroundElevation:

@@ -204,7 +204,13 @@ class Case:
         )
         free, hit = _words_of(*blocks)
         support = jnp.asarray(self.evidence.support, jnp.float32)
-        return Evidence(free=free, hit=hit, support=support, num_ranges=CONFIG.evidence.num_ranges)
+        return Evidence(
+            free=free,
+            hit=hit,
+            support=support,
+            steepest=jnp.float32(self.evidence.steepest),
+            num_ranges=CONFIG.evidence.num_ranges,
+        )
 
     @functools.cached_property
     def boxes(self) -> list[tuple[Proposal, reference.CompletedBox | None]]:

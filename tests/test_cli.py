@@ -37,19 +37,12 @@ from jaxbox.io import (
     write_calibration,
     write_labels,
 )
-from jaxbox.run import cache
 from jaxbox.run.processes import THREADS_VARIABLE
 from jaxbox.types import PointCloud, Status
 
 # Few beams, so that all sweeps of this file share the smallest capacity and one compile.
 CAPACITY = 16384
 make_small_sweep = functools.partial(synthetic.make_sweep, num_azimuths=250)
-
-
-@pytest.fixture(autouse=True)
-def _no_user_cache(monkeypatch):
-    """The tests leave the user's cache folder and JAX's settings alone."""
-    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
 
 
 def run(*arguments):
@@ -84,9 +77,7 @@ def kitti_folder(tmp_path_factory):
 def detected(kitti_folder, tmp_path_factory):
     """The two sweeps after `jaxbox detect`, with everything it writes."""
     output = tmp_path_factory.mktemp("detected")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(cache.CACHE_VARIABLE, "")
-        result = run("detect", kitti_folder, "--output", output, "--format", "both")
+    result = run("detect", kitti_folder, "--output", output, "--format", "both")
     assert result.exit_code == 0, result.output
     return output, result
 

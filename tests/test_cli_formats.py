@@ -23,17 +23,11 @@ from jaxbox.config import DetectorConfig
 from jaxbox.io import mcap_results, parquet
 from jaxbox.io import rerun as rerun_results
 from jaxbox.io.results import SweepResult
-from jaxbox.run import cache
 from jaxbox.types import PointCloud
 
 ALL = [word for name in ("jsonl", "parquet", "mcap", "csv", "rerun") for word in ("--format", name)]
 ONE_FILE = ALL[:8]
 FILES = ["detections.jsonl", "detections.mcap", "detections.parquet", "detections.csv"]
-
-
-@pytest.fixture(autouse=True)
-def _no_user_cache(monkeypatch):
-    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
 
 
 @pytest.fixture(scope="session")
@@ -78,9 +72,7 @@ def rows_of(records):
 def written(sweeps, tmp_path_factory):
     """All formats of the three sweeps."""
     output = tmp_path_factory.mktemp("written")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(cache.CACHE_VARIABLE, "")
-        result = detect(output, *sorted(sweeps.iterdir()), *ALL, "--json")
+    result = detect(output, *sorted(sweeps.iterdir()), *ALL, "--json")
     assert result.exit_code == 0, result.output
     return output, result
 

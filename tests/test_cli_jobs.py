@@ -14,15 +14,10 @@ from test_io_formats import write_foxglove
 
 from jaxbox import io
 from jaxbox.cli.results import Results
-from jaxbox.run import cache, processes
+from jaxbox.run import processes
 
 COMMON = ("--preset", "paper", "--format", "both", "--format", "parquet", "--format", "mcap")
 BROKEN = "000001"
-
-
-@pytest.fixture(autouse=True)
-def _no_user_cache(monkeypatch):
-    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
 
 
 @pytest.fixture(scope="session")
@@ -41,9 +36,7 @@ def street(tmp_path_factory):
 def alone(street, tmp_path_factory):
     """What one process writes, and says."""
     output = tmp_path_factory.mktemp("alone")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(cache.CACHE_VARIABLE, "")
-        return output, run("detect", street, "--output", output, *COMMON)
+    return output, run("detect", street, "--output", output, *COMMON)
 
 
 def files_of(output):

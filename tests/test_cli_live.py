@@ -10,16 +10,10 @@ from jaxbox import io
 from jaxbox.cli import live as command
 from jaxbox.live import page
 from jaxbox.live.records import LiveRecords
-from jaxbox.run import cache
 
 NUM_SWEEPS, STEP_M = 5, 1.0
 # The machine may be busy: nothing is to be skipped where that is not the question.
 SLOWLY = ("--rate-hz", 2, "--capacity", CAPACITY, "--poses", "boxes")
-
-
-@pytest.fixture(autouse=True)
-def _no_user_cache(monkeypatch):
-    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
 
 
 @pytest.fixture(scope="module")
@@ -35,9 +29,7 @@ def drive(tmp_path_factory):
 @pytest.fixture(scope="module")
 def lines(drive):
     """What a whole run prints."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(cache.CACHE_VARIABLE, "")
-        result = run("live", drive, "--json", *SLOWLY)
+    result = run("live", drive, "--json", *SLOWLY)
     assert result.exit_code == 0, result.output
     return [json.loads(line) for line in result.stdout.splitlines()]
 
@@ -120,6 +112,8 @@ def test_the_page_draws_the_newest_sweep_and_hands_thresholds_on(drive, monkeypa
 
         def show_words(self, answer, **_):
             assert "000" in answer
+            assert "from the end of the sweep to its boxes" in answer
+            assert "compiled" not in answer
 
         def follow(self, wanted):
             pass

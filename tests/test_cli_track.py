@@ -26,18 +26,12 @@ from jaxbox.io import rerun as rerun_results
 from jaxbox.io.mcap_file import open_mcap_file
 from jaxbox.io.parquet import TRACK_COLUMNS
 from jaxbox.io.results import SweepResult
-from jaxbox.run import cache
 
 STEP_M = 1.0
 LENGTHS = {"0000": 5, "0001": 3}
 ALL = [word for name in TrackFormat for word in ("--format", name)]
 FILMS = ["--pictures", "--video", "--gif", "--crops"]
 LIGHT = ["--format", "kitti", "--format", "jsonl", "--capacity", CAPACITY]
-
-
-@pytest.fixture(autouse=True)
-def _no_user_cache(monkeypatch):
-    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
 
 
 @pytest.fixture(scope="session")
@@ -71,9 +65,7 @@ def track(kitti, output, *arguments):
 def written(kitti, tmp_path_factory):
     """What a whole run writes, in every format, with pictures, crops and films."""
     output = tmp_path_factory.mktemp("written")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv(cache.CACHE_VARIABLE, "")
-        result = track(kitti, output, *ALL, *FILMS, "--capacity", CAPACITY)
+    result = track(kitti, output, *ALL, *FILMS, "--capacity", CAPACITY)
     assert result.exit_code == 0, result.output
     return output, result
 

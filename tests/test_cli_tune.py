@@ -12,7 +12,6 @@ from jaxbox import synthetic
 from jaxbox.cli import app
 from jaxbox.cli.tune import time_left
 from jaxbox.io import objects_from_detections, read_config, write_bin, write_calibration, write_labels
-from jaxbox.run import cache
 from jaxbox.run.compiled import count_compilations
 from jaxbox.tuning import Bench, Trial
 from jaxbox.types import PointCloud
@@ -22,11 +21,6 @@ FILES = ["best.json", "report.json", "report.md", "trials.csv"]
 # Cars of this length are completed to boxes that overlap with none of the labels enough.
 WRONG = "vehicles.classes.0.length_m=6.2"
 SEARCH = "vehicles.classes.0.length_m=3.6:4.4"
-
-
-@pytest.fixture(autouse=True)
-def _no_user_cache(monkeypatch):
-    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
 
 
 @pytest.fixture(scope="module")

@@ -22,11 +22,6 @@ from jaxbox.run import cache
 FORMATS = [word for name in ("kitti", "jsonl", "parquet", "mcap") for word in ("--format", name)]
 
 
-@pytest.fixture(autouse=True)
-def _no_user_cache(monkeypatch):
-    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
-
-
 @pytest.fixture(scope="module")
 def sweeps(tmp_path_factory):
     """Three streets with a camera."""

@@ -15,6 +15,8 @@ from test_live import NS, came
 
 from jaxbox import synthetic
 from jaxbox.io import InputError
+from jaxbox.io import velodyne as recorded
+from jaxbox.io.velodyne import MAX_TURN_PACKETS
 from jaxbox.live import Fault, LiveSweep, open_source, velodyne
 from jaxbox.live.sources import parse_udp
 from jaxbox.live.velodyne import UdpAddress, VelodyneSource
@@ -186,7 +188,7 @@ def test_nothing_that_is_sent_ends_the_source():
         listening.wait(lambda: len(listening.sweeps) >= num_before + 3)
     np.testing.assert_array_equal(listening.sweeps[-1].points.xyz, listening.sweeps[-2].points.xyz)
     # No turn of nonsense is larger than a sensor's can be.
-    assert max(item.num_points for item in listening.sweeps) <= 32 * 12 * velodyne.MAX_PACKETS
+    assert max(item.num_points for item in listening.sweeps) <= 32 * 12 * MAX_TURN_PACKETS
 
 
 def test_packets_of_a_model_with_more_lasers_than_the_calibration_end_nothing(tmp_path):
@@ -202,11 +204,11 @@ def test_packets_of_a_model_with_more_lasers_than_the_calibration_end_nothing(tm
 
 
 def test_a_turn_that_does_not_end_is_dropped(monkeypatch):
-    monkeypatch.setattr(velodyne, "MAX_PACKETS", 50)
+    monkeypatch.setattr(recorded, "MAX_TURN_PACKETS", 50)
     with Listening() as listening:
         listening.send([turns()[0][0]] * 60)
         listening.wait(lambda: listening.faults)
-    assert "50 packets, and the sensor has not turned round" in listening.faults[0]
+    assert "50 packets before this one, and the sensor has not turned half round" in listening.faults[0]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts what is lost")
@@ -238,6 +240,8 @@ def test_a_port_that_is_taken_and_unknown_models_are_said_at_once(tmp_path):
     (tmp_path / "lasers.yml").write_text("lasers: 3")
     with pytest.raises(InputError, match=r"lasers\.yml: no calibration"):
         open_source(f"udp://:0?model=HDL64E_S2&calibration={tmp_path / 'lasers.yml'}")
+    with pytest.raises(InputError, match=r"model HDL64E_S2: .* name a calibration"):
+        open_source("udp://:0?model=HDL64E_S2")
 
 
 @pytest.mark.parametrize(

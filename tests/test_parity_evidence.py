@@ -20,6 +20,7 @@ NUM_RAYS = parity.CONFIG.completion.num_rays
 
 ground_support = jax.jit(evidence.ground_support)
 first_returns = jax.jit(evidence.first_returns)
+steepest_beam = jax.jit(evidence.steepest_beam)
 
 
 @parity.PerForm
@@ -102,10 +103,33 @@ def test_evidence_differs_in_few_cells_only(cases):
         hits, frees = (parity.flagged(sums).T for sums in (case.evidence.hit_sums, case.evidence.free_sums))
         other_support = np.asarray(ours.support) != case.evidence.support
         parity.assert_share(np.sum(other_support), 200**2, 2e-3, "support")
+        # A rise on the edge of a level may round into the next.
+        assert abs(float(ours.steepest) - case.evidence.steepest) < 1e-3
         wrong += np.sum(hit != hits), hits.sum(), np.sum(free != frees), frees.sum()
     # A return whose azimuth or range lies on the edge of a cell may round into the next.
     parity.assert_share(*wrong[:2], 1e-4, "hits")
     parity.assert_share(*wrong[2:], 1e-4, "free cells")
+
+
+def test_the_highest_beam_is_that_of_most_points_and_not_of_strays():
+    rng = np.random.default_rng(0)
+    rho = rng.uniform(5, 60, 4000).astype(np.float32)
+    for top in (0.1037, 0.2137):
+        z = (rho * np.linspace(-0.4, top, 64)[rng.integers(0, 64, 4000)]).astype(np.float32)
+        z[:20] = 0.5 * rho[:20]
+        for mask in (np.ones(4000, bool), np.arange(4000) % 2 == 0):
+            found = float(steepest_beam(z, rho, mask))
+            assert found == pytest.approx(reference.steepest_beam(z[mask], rho[mask]), abs=1e-5)
+            assert top - 0.01 < found < top + 0.006
+        shuffled = rng.permutation(4000)
+        assert steepest_beam(z[shuffled], rho[shuffled], mask[shuffled]) == steepest_beam(z, rho, mask)
+    # Nothing is known: a few strays, near points, and no points.
+    for mask in (np.arange(4000) < 20, rho < evidence.STEEP_FROM_M, np.zeros(4000, bool)):
+        assert (
+            steepest_beam(z, rho, mask)
+            == np.float32(0.03)
+            == np.float32(reference.steepest_beam(z[mask], rho[mask]))
+        )
 
 
 def test_first_returns_are_those_of_the_reference(cases):

@@ -10,7 +10,7 @@ import pytest
 from jaxbox import reference, synthetic
 from jaxbox.config import RegionConfig
 from jaxbox.evaluation.corruptions import reflect_below_road
-from jaxbox.stages import filtering, ground
+from jaxbox.stages import _sheets, filtering, ground
 from jaxbox.synthetic.terrain import SENSOR_HEIGHT_M
 
 GROUND = parity.CONFIG.ground
@@ -20,6 +20,8 @@ filter_outliers = parity.PerForm(filtering.filter_outliers)
 cell_minima = jax.jit(ground.cell_minima)
 fit_ground_plane = parity.PerForm(ground.fit_ground_plane)
 fit_ground_surface = jax.jit(ground.fit_ground_surface)
+on_sheets = jax.jit(_sheets.on_sheets)
+planes_through_windows = jax.jit(_sheets.planes_through_windows)
 least_supported = jax.jit(ground.least_supported, static_argnums=(3, 4))
 height_above_ground = jax.jit(ground.height_above_ground)
 
@@ -106,6 +108,40 @@ def test_planes_of_different_draws_agree_where_one_has_decisive_support(cases):
     if case.name.startswith("seed"):
         assert len(decisive) >= parity.NUM_SEEDS / 4
         parity.assert_within(decisive, 1e-3, "m between decisive planes, within 20 m")
+
+
+def test_sheets_are_those_of_the_reference(cases):
+    judged = 0
+    for case in cases:
+        rng = np.random.default_rng(0)
+        cell = np.floor((case.xyz[case.inlier, :2] + 80) / 0.5).astype(int).clip(0, 319)
+        lowest = np.full((320, 320), np.inf, np.float32)
+        np.minimum.at(lowest, tuple(cell.T), case.height[case.inlier])
+        # Fewer returns, and a ramp to one side, whose steepness passes the limit.
+        lowest[rng.random(lowest.shape) < 0.1] = np.inf
+        lowest += (np.arange(320, dtype=np.float32) / 320)[:, None] ** 4 * 30
+        ours, expected = (
+            np.asarray(on_sheets(lowest, GROUND)),
+            reference.on_sheets(lowest.astype(float), GROUND),
+        )
+        judged += expected.sum()
+        # A window on the edge of a limit may round to either side of it: that is four cells.
+        parity.assert_share((ours != expected).sum(), expected.sum(), 5e-3, "cells on sheets")
+    assert judged > 400 * len(cases)
+
+
+def test_windows_without_a_plane_say_so():
+    square = np.full((12, 12), np.inf, np.float32)
+    square[2, 2:9], square[9, 9] = 0.5, 0.3
+    for module, compiled in (
+        (reference, reference.planes_through_windows),
+        (_sheets, planes_through_windows),
+    ):
+        num, level, rise, rms = map(np.asarray, compiled(square))
+        assert num.max() == 5, module
+        assert (level == 0).all()
+        assert np.isinf(rise).all()
+        assert np.isfinite(rms).all()
 
 
 # Gaussians of the default reach as far as the band of their matrix, the wider ones beyond it.

@@ -12,7 +12,7 @@ import pytest
 from jaxbox import reference
 from jaxbox.geometry import planar
 from jaxbox.stages import _surroundings, scoring
-from jaxbox.stages.state import Obstacles
+from jaxbox.stages.state import NeighbourhoodCounts, Obstacles
 from jaxbox.xla import backend
 
 SETTINGS = parity.CONFIG.vehicles
@@ -100,16 +100,16 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
 
 @jax.jit
 def score_boxes(columns, prior):
-    around = _surroundings.NeighbourhoodCounts(jnp.stack(columns["around"], axis=1))
+    around = NeighbourhoodCounts(jnp.stack(columns["around"], axis=1))
     seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "objective"))
     early = scoring.evidence_score(*seen, SETTINGS)
-    late = scoring.neighbourhood_score(around, columns["rho"], prior, SETTINGS)
+    late, _ = scoring.neighbourhood_score(around, columns["rho"], columns["reach"], prior, SETTINGS)
     return early * scoring.size_score(columns["length"], columns["width"], prior) * late * prior.prior_weight
 
 
 @jax.jit
 def end_where_seen(boxes, columns, usual_m):
-    around = _surroundings.NeighbourhoodCounts(columns)
+    around = NeighbourhoodCounts(columns)
     return scoring.end_where_seen(boxes, around, usual_m, parity.CONFIG.completion, 0.004)
 
 
@@ -126,6 +126,7 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
         "support": rng.integers(0, 30, MAX_BOXES),
         "objective": rng.uniform(2, 3, MAX_BOXES),
         "rho": rng.uniform(2, 80, MAX_BOXES),
+        "reach": rng.uniform(1, 6, MAX_BOXES),
         "around": [
             rng.integers(1, 400, MAX_BOXES),
             prior.height_m + rng.normal(0, 0.5, MAX_BOXES),
@@ -152,6 +153,7 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
                 num_points=int(columns["num_points"][row]),
                 **one,
                 config=SETTINGS,
+                reach=float(columns["reach"][row]),
             )
         )
     expected = np.array(expected)

@@ -7,10 +7,9 @@ import pathlib
 import lidar_packets as packets
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from test_cli import run
 
 from jaxbox import DetectorConfig, io
-from jaxbox.cli.app import app
 from jaxbox.cli.inputs import RunOptions, prepare_run
 from jaxbox.geometry.rigid import rotation_about_z
 from jaxbox.io import PointConvention
@@ -194,10 +193,6 @@ def test_real_sweeps_tell_their_columns(data_root):
 
 
 # --- the command line -----------------------------------------------------------------------------
-
-
-def run(*args):
-    return CliRunner().invoke(app, [str(arg) for arg in args])
 
 
 def test_info_looks_at_what_the_detector_would_see(tmp_path):

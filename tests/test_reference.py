@@ -211,6 +211,25 @@ def test_envelope_keeps_a_steep_block_out_of_the_ground():
     assert height[block].min() > 0.75
 
 
+@pytest.mark.parametrize("grade", [0.1, 0.2])
+def test_a_ramp_is_ground_and_a_car_on_it_is_not(grade):
+    xy = np.random.default_rng(5).uniform(-30, 30, (60000, 2))
+    # A car with its road about it out of sight on the far side.
+    is_car = (np.abs(xy - [16, 0]) < [2, 0.8]).all(axis=1)
+    hidden = (np.abs(xy - [17, 2]) < [2, 1.2]).all(axis=1) & ~is_car
+    rise = np.maximum(xy[:, 0] - 6, 0) * grade
+    xyz = np.column_stack([xy, rise - 1.7 + np.where(is_car, 0.9, 0)])[~hidden]
+    is_car, plane = is_car[~hidden], np.array([0.0, 0.0, -1.7])
+    inner = (np.abs(xyz[:, :2]) < 17).all(axis=1) & (np.hypot(*xyz[:, :2].T) > 5)
+    for config, found in ((GROUND, 0.98), (dataclasses.replace(GROUND, sheet_tolerance_m=0.0), 0.0)):
+        grid = reference.fit_ground_surface(xyz, plane, config)
+        height = reference.height_above_ground(xyz, plane, grid, config)
+        on_ramp = inner & ~is_car & (xyz[:, 0] > 12)
+        assert (np.abs(height[on_ramp]) < config.min_height_m).mean() >= found
+        assert height[is_car].min() > 0.6
+    assert (np.abs(height[on_ramp]) < config.min_height_m).mean() < 0.5
+
+
 def test_surface_is_bilinear_between_cell_centres_and_constant_beyond_the_border():
     centers = np.arange(8) - 3.5
     grid = 2 * centers[:, None] + 3 * centers[None, :]
@@ -514,7 +533,7 @@ def test_without_evidence_every_ray_counts_as_hit_and_the_ground_is_not_looked_a
     completed = reference.Completed([reference.ClassHypothesis(0, Label.CAR)], [box], 1)
     config = DetectorConfig.paper()
     nothing = reference.index_obstacles(np.zeros((0, 3)), np.zeros(0), np.zeros(0, int))
-    (candidate,) = reference.score_boxes(completed, None, [cluster], nothing, config)
+    (candidate,) = reference.score_boxes(completed, None, np.array([np.inf]), [cluster], nothing, config)
     around = reference.cluster_alone(50, 1.5)
     found = {"hit": 1.0, "free_length": 0.0, "support": None}
     expected = reference.score_box(box, CAR, around=around, num_points=50, **found, config=config.vehicles)
@@ -845,6 +864,11 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     low = dataclasses.replace(around, top=1.2)
     assert score(around=low) == pytest.approx(np.exp(-((0.225 / 0.3) ** 2)))
     assert score(moved(PERFECT_BOX, x=30), around=low) == 1
+    # Or by any, where the highest beam passes there: then its height is not known.
+    assert score(around=low, reach=1.2) == score(around=dataclasses.replace(low, top=0.5), reach=0.5) == 0.7
+    assert score(around=low, reach=1.31) == score(around=low)
+    assert score(around=dataclasses.replace(low, top=0.39), reach=0.39) == 0
+    assert score(reach=1.5) == 1
 
 
 @pytest.mark.parametrize(

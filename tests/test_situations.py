@@ -26,6 +26,8 @@ IN_SHORT = {
     "very near: middle 3 m away": 15,
     "under a ceiling: 2.3 m": 6,
     "under a ceiling: 3 m": 6,
+    "other sizes: box vans": 3,
+    "mounts: on a slope of 10 %": 9,
 }
 """Situations that the suite runs, and how many vehicles are to be found in each."""
 

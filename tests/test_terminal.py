@@ -8,14 +8,8 @@ from test_cli import make_small_sweep, run, write_points
 
 from jaxbox.cli import console
 from jaxbox.cli.report import make_table
-from jaxbox.run import cache
 
 EVIL = "a\x1b]0;owned\x07\x1b[31m\nerror: b\r\x9b2J\u202e"
-
-
-@pytest.fixture(autouse=True)
-def _no_user_cache(monkeypatch):
-    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
 
 
 def unprintable(text):

@@ -21,9 +21,9 @@ from websockets.sync.client import connect
 
 from jaxbox import DetectorConfig, PointCloud, _extras, io
 from jaxbox.cli import view as view_command
+from jaxbox.cli.box_filter import BoxFilter
 from jaxbox.config import propose_capacities
 from jaxbox.config.fields import check_traced
-from jaxbox.run import cache
 from jaxbox.run.compiled import count_compilations
 from jaxbox.types import Status
 from jaxbox.viewer import (
@@ -422,6 +422,20 @@ def test_the_loop_answers_what_is_wanted(started):
     assert page.followed[-1].view.min_score == 0.25, "one wish keeps the others"
 
 
+def test_only_boxes_of_the_chosen_area_are_shown(folder):
+    session, near = Session(Frames(io.open_sweeps(folder))), BoxFilter.chosen(classes="car", within="12")
+    scenes = []
+    for keep in (None, near):
+        page = FakePage()
+        Viewer(session, page, keep=keep).answer(Wanted())
+        scenes.append(page.scenes[-1])
+        assert f"'vehicles'>{scenes[-1].num_boxes}<" in page.answers[-1]
+    everywhere, within = (np.linalg.norm(scene.boxes.center[:, :2], axis=1) for scene in scenes)
+    assert 0 < len(within) < len(everywhere)
+    np.testing.assert_array_equal(within, everywhere[everywhere <= 12])
+    np.testing.assert_array_equal(scenes[1].points, scenes[0].points)
+
+
 def test_an_unreadable_sweep_is_told_and_the_others_go_on(started):
     viewer, page = started
     viewer.want(index=1)
@@ -592,12 +606,6 @@ def test_an_address_of_another_machine_is_refused(host):
 # The command.
 
 
-@pytest.fixture
-def _no_user_cache(monkeypatch):
-    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
-
-
-@pytest.mark.usefixtures("_no_user_cache")
 def test_a_taken_port_is_an_error_and_not_the_next_one(server, folder):
     result = run("view", folder, "--port", server.get_port())
     assert result.exit_code == 2
@@ -605,7 +613,6 @@ def test_a_taken_port_is_an_error_and_not_the_next_one(server, folder):
     assert "--port" in result.stderr
 
 
-@pytest.mark.usefixtures("_no_user_cache")
 def test_bad_input_ends_before_anything_is_served(tmp_path):
     result = run("view", tmp_path / "nothing")
     assert result.exit_code == 2
@@ -615,7 +622,6 @@ def test_bad_input_ends_before_anything_is_served(tmp_path):
     assert "vehicles.max_overlap" in result.stderr
 
 
-@pytest.mark.usefixtures("_no_user_cache")
 def test_the_missing_extra_is_named(folder, monkeypatch):
     there = _extras.importlib.import_module
 
@@ -631,7 +637,6 @@ def test_the_missing_extra_is_named(folder, monkeypatch):
     assert "pip install 'jaxbox[view]'" in result.stderr
 
 
-@pytest.mark.usefixtures("_no_user_cache")
 @pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
 def test_the_command_tells_the_address_and_ends_on_interrupt(host, folder, monkeypatch):
     asked = []
@@ -648,7 +653,6 @@ def test_the_command_tells_the_address_and_ends_on_interrupt(host, folder, monke
     assert (asked[0].preset, asked[0].view.min_score) == ("paper", 0.4)
 
 
-@pytest.mark.usefixtures("_no_user_cache")
 def test_the_command_shows_a_tilted_sweep_upright(tmp_path, monkeypatch):
     sin, cos = np.sin(0.2), np.cos(0.2)
     np.save(tmp_path / "a.npy", street(0).xyz @ np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]]).T)

@@ -13,7 +13,6 @@ from viewer_sweeps import write_three_streets
 from jaxbox import DetectorConfig, io
 from jaxbox.cli.view import distinct_names
 from jaxbox.config.fields import replace_fields, traced_ranges
-from jaxbox.run import cache
 from jaxbox.viewer import (
     THRESHOLDS,
     Comparison,
@@ -267,7 +266,6 @@ def test_a_real_page_draws_both_flies_and_turns_light(folder):
 
 
 def test_the_command_compares_presets_files_and_sweeps(folder, tmp_path, monkeypatch):
-    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
     asked = []
 
     def interrupted(viewer):

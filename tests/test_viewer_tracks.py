@@ -10,7 +10,6 @@ from test_viewer import FakePage
 
 import jaxbox
 from jaxbox import DetectorConfig, Motion, TrackStatus, io
-from jaxbox.run import cache
 from jaxbox.tracking import Poses, PoseSource, Sight
 from jaxbox.tracking.trails import TRAIL_S
 from jaxbox.viewer import (
@@ -309,7 +308,6 @@ def test_a_wish_ends_the_tracking_that_it_makes_needless_and_what_is_done_is_kep
 
 
 def test_the_command_begins_with_tracks(folder, monkeypatch):
-    monkeypatch.setenv(cache.CACHE_VARIABLE, "")
     asked = []
 
     def interrupted(viewer):

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from jaxbox._loopback import LOOPBACK
 from jaxbox._version import __version__
 from jaxbox.cli.box_filter import BoxFilter, ClassesOption, WithinOption
 from jaxbox.cli.config_options import chosen_config, chosen_preset
@@ -49,7 +50,7 @@ from jaxbox.cli.view import ViewOptions, run_view
 from jaxbox.cluster.dataset import SWEEPS_PER_PARTITION
 from jaxbox.evaluation.copies import COPIES
 from jaxbox.evaluation.objectives import OBJECTIVES
-from jaxbox.io import ORDINARY, InputError, PointConvention, open_sweeps
+from jaxbox.io import InputError, PointConvention, open_sweeps
 from jaxbox.run.cache import enable_cache
 
 DETECT_EXAMPLES = """Examples:
@@ -212,14 +213,15 @@ def detect(
         keep = BoxFilter.chosen(classes=classes, within=within)
         convention = PointConvention(scale, axes, flip, columns)
         if engine is Engine.RAY:
-            check_ray({"--classes": classes, "--within": within, "--crops": crops})
+            kept, drawn = (
+                {"--classes": classes, "--within": within},
+                {"--pictures": pictures, "--crops": crops},
+            )
+            other = kept | drawn | {"--level": level, "--sensor-at": sensor_at}
+            check_ray(other, formats=result_format, points=points, convention=convention)
             ray_options = DetectRayOptions(
                 output=output,
                 config=config,
-                formats=frozenset(result_format or []),
-                pictures=bool(pictures),
-                points=points,
-                mounted=level or sensor_at is not None or convention != ORDINARY,
                 address=address,
                 jobs=jobs,
                 sweeps_per_partition=sweeps_per_partition or SWEEPS_PER_PARTITION,
@@ -382,7 +384,7 @@ def view(
     *,
     host: Annotated[
         str, typer.Option(help="Address to listen at. The default is reached from this machine only.")
-    ] = "127.0.0.1",
+    ] = LOOPBACK,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")] = 8080,
     open_browser: Annotated[bool, typer.Option("--open", help="Open the browser at the page.")] = False,
     track: Annotated[
@@ -409,6 +411,8 @@ def view(
         float,
         typer.Option(min=0.0, max=1.0, help="Boxes that score less are hidden at first."),
     ] = SHOWN_MIN_SCORE,
+    classes: ClassesOption = None,
+    within: WithinOption = None,
 ) -> None:
     """Show sweeps and boxes in the browser, and move thresholds live (the view extra).
 
@@ -426,6 +430,7 @@ def view(
             convention=PointConvention(scale, axes, flip, columns),
             capacity=capacity,
             min_score=min_score,
+            keep=BoxFilter.chosen(classes=classes, within=within),
             track=track,
             open_browser=open_browser,
             light=light,

@@ -12,6 +12,7 @@ from rich.text import Text
 
 from jaxbox import io
 from jaxbox._interrupts import heard, stoppable
+from jaxbox._loopback import LOOPBACK_NAMES
 from jaxbox.cli.console import ExitCode, exit_code, print_warning, printable, stderr, stdout
 from jaxbox.cli.inputs import print_json
 from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
@@ -27,7 +28,6 @@ from jaxbox.live.records import LiveRecords
 from jaxbox.live.ros2 import open_ros2
 from jaxbox.live.sinks import Sink
 from jaxbox.live.sources import is_sensor, open_sensor
-from jaxbox.viewer.server import LOOPBACK_NAMES
 
 STATUS_S = 0.25
 """How often the status line is drawn, s."""

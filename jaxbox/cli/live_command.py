@@ -4,6 +4,7 @@ from typing import Annotated
 
 import typer
 
+from jaxbox._loopback import LOOPBACK
 from jaxbox.cli.config_options import chosen_config, chosen_track_config
 from jaxbox.cli.console import input_errors
 from jaxbox.cli.live import LiveOptions, run_live
@@ -74,7 +75,7 @@ def live(
     host: Annotated[
         str,
         typer.Option(help="Address that servers listen at. The default is reached from this machine only."),
-    ] = "127.0.0.1",
+    ] = LOOPBACK,
     points: Annotated[bool, typer.Option("--points/--no-points", help="Serve the points, too.")] = True,
     ros2: Annotated[
         bool, typer.Option("--ros2", help="Publish /jaxbox/detections and /jaxbox/markers in ROS 2.")

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from rich.progress import Progress
@@ -11,7 +11,8 @@ from jaxbox._interrupts import stoppable
 from jaxbox.cli.console import ExitCode, exit_code, make_progress, print_error, stderr, stdout
 from jaxbox.cluster import ClusterError, DatasetReport, DriveReport, PartitionReport
 from jaxbox.config import DetectorConfig
-from jaxbox.io import InputError
+from jaxbox.io import InputError, PointConvention
+from jaxbox.io.convention import ORDINARY
 
 _PARQUET = "parquet"
 OnReport = Callable[[PartitionReport, int], None]
@@ -26,14 +27,6 @@ class RayOptions:
     """Folder or URL of the results."""
     config: DetectorConfig
     """The detector's settings."""
-    formats: frozenset[str]
-    """What was asked for; only Parquet can be written."""
-    pictures: bool
-    """Whether pictures were asked for; none can be drawn."""
-    points: bool | None
-    """Whether the points were asked for; None where nothing was said, as Parquet holds none."""
-    mounted: bool
-    """Whether points are to be seen level, from elsewhere, or otherwise than as they are, which none can."""
     address: str | None
     """Of the cluster; None to start one here."""
     jobs: int | None
@@ -56,28 +49,6 @@ class RayOptions:
         """Whether sentences are printed."""
         return not (self.quiet or self.json)
 
-    def check(self) -> None:
-        """Refuses what the workers cannot do.
-
-        Raises:
-          InputError: naming the option.
-        """
-        if self.mounted:
-            raise InputError(
-                "--level, --sensor-at, --scale, --axes, --flip and --columns: --engine ray takes sweeps as "
-                "they are; leave these out."
-            )
-        if other := self.formats - {_PARQUET}:
-            raise InputError(
-                f"--format {min(other)}: the workers of --engine ray write parquet; leave it out."
-            )
-        if self.pictures:
-            raise InputError("--pictures: the workers of --engine ray draw none; leave the option out.")
-        if self.points is not None:
-            raise InputError(
-                "--points and --no-points: the parquet of --engine ray holds no points; leave the option out."
-            )
-
     def common(self) -> dict[str, Any]:
         """Options that the functions of `jaxbox.cluster` have in common, by name."""
         return {
@@ -90,18 +61,36 @@ class RayOptions:
         }
 
 
-def check_ray(options: Mapping[str, object]) -> None:
+def check_ray(
+    options: Mapping[str, object],
+    *,
+    formats: Iterable[str] | None,
+    points: bool | None,
+    convention: PointConvention,
+) -> None:
     """Refuses what is not for this engine.
 
     Args:
-      options: by name, what was given.
+      options: by name, what else was given that the workers cannot do.
+      formats: what is to be written; None where nothing was said.
+      points: whether the points are to be written; None where nothing was said.
+      convention: how the numbers of the points are to be taken.
 
     Raises:
-      InputError: naming the first that was.
+      InputError: naming the first that was given.
     """
-    for name, value in options.items():
+    given = {
+        **{f"--format {name}": name != _PARQUET for name in formats or ()},
+        "--points and --no-points": points is not None,
+        "--scale, --axes, --flip and --columns": convention != ORDINARY,
+        **options,
+    }
+    for name, value in given.items():
         if value:
-            raise InputError(f"{name}: the workers of --engine ray have no such option; leave it out.")
+            raise InputError(
+                f"{name}: the workers of --engine ray write parquet, all boxes of sweeps as they are and no "
+                "points, and draw nothing; leave it out."
+            )
 
 
 def check_local(output: str, address: str | None) -> None:
@@ -127,10 +116,9 @@ def run_on_ray(options: RayOptions, start: Callable[[OnReport], DatasetReport[An
       `ExitCode.INTERRUPTED`, or `FRAME_FAILED` where a sweep failed or Ray gave up.
 
     Raises:
-      InputError: where there are no sweeps, or the options cannot be used.
+      InputError: where there are no sweeps, or those of OUTPUT are others.
       ImportError: without the extra ``ray``.
     """
-    options.check()
     try:
         with stoppable(), make_progress(shown=options.speaks) as progress:
             report = start(_teller(options, progress))

@@ -36,7 +36,7 @@ from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.cli.track import TrackOptions, run_track
 from jaxbox.cli.track_ray import TrackRayOptions, run_track_ray
 from jaxbox.cli.track_results import TrackFormat
-from jaxbox.io import ORDINARY, PointConvention
+from jaxbox.io import PointConvention
 from jaxbox.io.poses import AUTO
 from jaxbox.run.pose_providers import ESTIMATED
 from jaxbox.run.tracking import MAX_TRACKS, RATE_HZ
@@ -183,24 +183,21 @@ def track(
             "max_tracks": max_tracks,
             "smooth": smooth,
             "confirmed": confirmed,
-            "coasting": coasting,
             "topic": topic,
             "capacity": capacity,
             "min_score": min_score,
-            "pictures": pictures,
-            "video": video,
             "resume": resume,
             "quiet": quiet,
             "json": json,
         }
         keep = BoxFilter.chosen(classes=classes, within=within)
         if engine is Engine.RAY:
-            check_ray({"--classes": classes, "--within": within, "--crops": crops, "--gif": gif})
+            kept = {"--classes": classes, "--within": within, "--coasting": coasting}
+            drawn = {"--pictures": pictures, "--video": video, "--gif": gif, "--crops": crops}
+            other = kept | drawn | {"--level": level, "--sensor-at": sensor_at}
+            check_ray(other, formats=result_format, points=points, convention=convention)
             ray_options = TrackRayOptions(
                 output=output,
-                formats=frozenset(result_format or []),
-                points=points,
-                mounted=level or sensor_at is not None or convention != ORDINARY,
                 address=address,
                 jobs=jobs,
                 **common,
@@ -212,6 +209,9 @@ def track(
             formats=frozenset(result_format or [TrackFormat.KITTI]),
             keep=keep,
             crops=crops,
+            coasting=coasting,
+            pictures=pictures,
+            video=video,
             sheet=sheet,
             gif=gif,
             points=True if points is None else points,

@@ -7,7 +7,6 @@ from jaxbox.cli.console import ExitCode
 from jaxbox.cli.ray_engine import RayOptions, run_on_ray
 from jaxbox.cluster import track_dataset
 from jaxbox.config import TrackConfig
-from jaxbox.io import InputError
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,25 +25,6 @@ class TrackRayOptions(RayOptions):
     """Whether the whole drive is looked at before anything is written."""
     confirmed: bool
     """Whether only confirmed tracks are written."""
-    coasting: bool
-    """Whether KITTI text was to hold all tracks; Parquet does."""
-    video: bool
-    """Whether videos were asked for; none can be drawn."""
-
-    def check(self) -> None:
-        """Refuses what the workers cannot do.
-
-        Raises:
-          InputError: naming the option.
-        """
-        super().check()
-        if self.video:
-            raise InputError("--video: the workers of --engine ray draw none; leave the option out.")
-        if self.coasting:
-            raise InputError(
-                "--coasting: it is for KITTI text, and the parquet of --engine ray holds all tracks; leave "
-                "it out."
-            )
 
 
 def run_track_ray(paths: Sequence[str], options: TrackRayOptions) -> ExitCode:

@@ -10,12 +10,13 @@ from rich.console import Console
 
 from jaxbox import io
 from jaxbox._interrupts import heard, stoppable
+from jaxbox._loopback import LOOPBACK_NAMES
+from jaxbox.cli.box_filter import EVERY_BOX, BoxFilter
 from jaxbox.cli.config_options import chosen_config
 from jaxbox.cli.console import ExitCode, stderr
 from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
 from jaxbox.config import DetectorConfig
 from jaxbox.viewer import Comparison, View, Wanted, open_viewer
-from jaxbox.viewer.server import LOOPBACK_NAMES
 
 APART_M = 80.0
 """Two recordings are drawn so far from each other: farther than most boxes are found to the side."""
@@ -45,6 +46,8 @@ class ViewOptions:
     """Points a sweep is padded to, or None for what it needs."""
     min_score: float
     """Boxes of lower scores are hidden at first."""
+    keep: BoxFilter = EVERY_BOX
+    """Which boxes and tracks are shown."""
     track: bool
     """Whether tracks are shown at first."""
     open_browser: bool
@@ -85,6 +88,7 @@ def run_view(paths: Sequence[str], options: ViewOptions, console: Console) -> Ex
         port=options.port,
         capacity=options.capacity,
         comparison=comparison,
+        keep=options.keep,
     ) as (viewer, url):
         _announce(url, options, len(sweeps), console)
         try:

@@ -40,6 +40,8 @@ class ClassPrior:
     """Width of the height score above the prior."""
     min_height_m: Scalar
     """Lower tops, after the range allowance, are not such a vehicle."""
+    min_cut_height_m: Scalar
+    """The same where the highest beam cuts the top off."""
     max_height_m: Scalar
     """Higher tops are not such a vehicle."""
     max_length_m: Scalar
@@ -59,6 +61,9 @@ class ClassPrior:
     past_ends_m: Scalar
     """Points so much farther past the ends of the box speak against it too, see ``vehicles.ring_m``: walls
     and facades go on there."""
+    open_below: Scalar
+    """Share of the free space behind hits that is no evidence against such a vehicle: 1 where beams pass
+    below the body, 0 where they do not."""
 
 
 _FRONT_PROFILES = {
@@ -147,6 +152,7 @@ class Label(enum.IntEnum):
         height_below_m=0.3,
         height_above_m=0.6,
         min_height_m=1.0,
+        min_cut_height_m=0.4,
         max_height_m=2.3,
         max_length_m=6.5,
         max_width_m=2.4,
@@ -155,6 +161,7 @@ class Label(enum.IntEnum):
         count_max_height_m=2.2,
         recess_m=0.3,
         past_ends_m=0.0,
+        open_below=0.0,
     )
     VAN = ClassPrior(
         length_m=4.98,
@@ -166,6 +173,7 @@ class Label(enum.IntEnum):
         height_below_m=0.35,
         height_above_m=0.35,
         min_height_m=2.2,
+        min_cut_height_m=2.2,
         max_height_m=2.7,
         max_length_m=7.5,
         max_width_m=2.6,
@@ -174,6 +182,7 @@ class Label(enum.IntEnum):
         count_max_height_m=2.7,
         recess_m=0.15,
         past_ends_m=0.0,
+        open_below=0.0,
     )
     TRUCK = ClassPrior(
         length_m=8.5,
@@ -185,6 +194,7 @@ class Label(enum.IntEnum):
         height_below_m=0.8,
         height_above_m=0.8,
         min_height_m=2.4,
+        min_cut_height_m=1.8,
         max_height_m=4.2,
         max_length_m=18.0,
         max_width_m=3.2,
@@ -193,4 +203,5 @@ class Label(enum.IntEnum):
         count_max_height_m=4.2,
         recess_m=-1.0,
         past_ends_m=2.0,
+        open_below=1.0,
     )

@@ -107,12 +107,17 @@ class GroundConfig:
     """Growth of that band with range, m/m."""
     band_above_m: Scalar = 0.3
     """Points higher than the plane by more than this, at the sensor, are not ground."""
-    band_above_grade: Scalar = 0.06
+    band_above_grade: Scalar = 0.12
     """Growth of that band with range, m/m."""
     blind_radius_m: Scalar = 2.5
     """Points nearer than this are the ego vehicle, not ground."""
     envelope_margin_m: Scalar = 0.1
     """A cell minimum within this of the lower envelope is ground."""
+    sheet_tolerance_m: Scalar = 0.04
+    """Smooth sheets of 5 x 5 m, such as ramps, are ground wherever they are within the band: they deviate
+    from a plane by less than this in the mean. 0 takes none."""
+    max_sheet_grade: Scalar = 0.25
+    """Steepest rise of such a sheet relative to the plane, m/m."""
     min_support_share: Scalar = 0.05
     """Ground has, within 3 m, at least this share of the points up to 1.2 m above it at about its height
     (.1 to .2 m); what lies below is a reflection. 0 asks for none."""
@@ -337,6 +342,9 @@ class VehicleConfig:
     """score x exp(-weight x ring points / points)."""
     overhead_weight: Scalar = 6.0
     """score x exp(-weight x points above / points), where those above are connected to the vehicle."""
+    cut_score: Scalar = 0.7
+    """Score of the height where the highest beam cuts a vehicle off below its usual height, so that the
+    height is not known. 0 takes the top of the points for that of the vehicle."""
     overhead_gap_m: Scalar = 0.25
     """They are connected where the gap between its top and the height from which points are above is at most
     this, and are not where it is twice this: a ceiling or a crown is no part of what stands under it."""

@@ -26,14 +26,14 @@ from jaxbox.io.recordings import Message, RecordedSweeps, RecordingFormat, choos
 
 PACKET_BYTES = 1206
 """Of a data packet of any model: twelve blocks of 100 bytes, a time and two bytes about the sensor."""
+MAX_TURN_PACKETS = 10_000
+"""An Alpha Prime that sends two returns needs 2600 for its slowest turn."""
 
 _LAST_BLOCK = slice(1102, 1104)
 _FIRST_BLOCK = slice(2, 4)
 _FULL_TURN = 36000
 _MAX_TURN_NS = 300_000_000
 """The slowest turn takes 0.2 s; what is further apart is not of one."""
-_MAX_TURN_PACKETS = 10_000
-"""An Alpha Prime that sends two returns needs 2600 for its slowest turn."""
 _FACTORY_BYTES = slice(-2, None)
 _NUM_LOOKED_AT = 5
 _MAX_STATUS_PACKETS = 20_000
@@ -87,6 +87,8 @@ class TurnBatcher:
         # Azimuths, of which all but the first are counted from it.
         self._cut: int | None = None
         self._began = self._reached = 0
+        self.num_dropped = 0
+        """Packets of turns of which less than half came."""
 
     def push(self, time_ns: int, data: bytes) -> list[Packet] | None:
         """Takes the next packet.
@@ -104,7 +106,7 @@ class TurnBatcher:
             self._cut = first
         reached = (last - self._cut) % _FULL_TURN
         late = bool(self._packets) and time_ns - self._packets[0][0] > _MAX_TURN_NS
-        late |= len(self._packets) >= _MAX_TURN_PACKETS
+        late |= len(self._packets) >= MAX_TURN_PACKETS
         done = self.finish() if late or reached < self._reached else None
         if not self._packets:
             self._began = reached - (last - first) % _FULL_TURN
@@ -116,7 +118,10 @@ class TurnBatcher:
         """The packets of the turn that was begun, or None where less than half of it came."""
         packets, covered = self._packets, self._reached - self._began
         self._packets, self._began, self._reached = [], 0, 0
-        return packets if 2 * covered > _FULL_TURN else None
+        if 2 * covered > _FULL_TURN:
+            return packets
+        self.num_dropped += len(packets)
+        return None
 
 
 class VelodynePoints:

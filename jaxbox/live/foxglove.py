@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from jaxbox._extras import require
+from jaxbox._loopback import LOOPBACK
 from jaxbox.io import InputError
 from jaxbox.io.mcap_results import add_result, record_schema
 from jaxbox.io.results import SweepResult
@@ -23,7 +24,7 @@ MAX_WAITING = 64
 
 @contextlib.contextmanager
 def open_foxglove(
-    *, host: str = "127.0.0.1", port: int = PORT, points: bool = True
+    *, host: str = LOOPBACK, port: int = PORT, points: bool = True
 ) -> Iterator[tuple[Sink, str]]:
     """Serves results to Foxglove while the context is open.
 

@@ -5,6 +5,7 @@ import dataclasses
 import threading
 from collections.abc import Callable, Iterator
 
+from jaxbox._loopback import LOOPBACK
 from jaxbox.config import DetectorConfig
 from jaxbox.io.results import SweepResult
 from jaxbox.live.loop import LiveResult
@@ -23,7 +24,7 @@ PORT = 8080
 
 @contextlib.contextmanager
 def open_page(
-    wanted: Wanted, use: Callable[[DetectorConfig], None], *, host: str = "127.0.0.1", port: int = PORT
+    wanted: Wanted, use: Callable[[DetectorConfig], None], *, host: str = LOOPBACK, port: int = PORT
 ) -> Iterator[tuple[Sink, str]]:
     """Serves a page while the context is open; a thread of its own draws the newest sweep.
 
@@ -68,6 +69,8 @@ def open_page(
 
 class _Newest(Session):
     """The newest sweep, in which somebody else has detected already."""
+
+    detects = False
 
     def __init__(self, use: Callable[[DetectorConfig], None]) -> None:
         super().__init__(Frames(()))

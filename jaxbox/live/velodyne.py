@@ -15,6 +15,7 @@ import sys
 from collections.abc import Iterator
 
 from jaxbox._extras import require
+from jaxbox._loopback import LOOPBACK, LOOPBACK_NAMES
 from jaxbox.io import InputError, TimedPoints
 from jaxbox.io.velodyne import (
     PACKET_BYTES,
@@ -24,12 +25,9 @@ from jaxbox.io.velodyne import (
     read_calibrated_sensor,
 )
 from jaxbox.live.sweep import IDLE_S, Fault, LiveSweep, now_ns
-from jaxbox.viewer.server import LOOPBACK_NAMES
 
 PORT = 2368
 """To which Velodyne sensors send unless they are told otherwise."""
-MAX_PACKETS = 8192
-"""A turn has fewer: the VLS-128 sends 12,600 a second with two returns, and turns 5 times a second."""
 _BUFFER_BYTES = 2**22
 """Of the socket: a second of the busiest sensor."""
 _STAMP = struct.Struct("@ll")
@@ -44,7 +42,7 @@ _NS_PER_S = 10**9
 class UdpAddress:
     """Where packets come in, and from whom."""
 
-    host: str = "127.0.0.1"
+    host: str = LOOPBACK
     """Address of this machine to listen at."""
     port: int = PORT
     """Port to listen at; 0 takes a free one."""
@@ -133,26 +131,27 @@ class _Turns:
 
     def reset(self) -> None:
         """Forgets the turn that was begun."""
-        self._batcher, self._num_packets = TurnBatcher(), 0
+        self._batcher = TurnBatcher()
 
     def add(self, packet: bytes, stamp_ns: int) -> tuple[TimedPoints, int] | None:
         """The points of a turn and when its last packet came, with the packet that begins the next.
 
         Raises:
-          InputError: for what is no packet, does not end a turn when it must, or cannot be decoded.
+          InputError: for what is no packet, for packets that make no turn, or that cannot be decoded.
         """
         if len(packet) != PACKET_BYTES:
             raise InputError(f"{len(packet)} bytes, and packets of a Velodyne sensor have {PACKET_BYTES}.")
+        num_dropped = self._batcher.num_dropped
         turn = self._batcher.push(stamp_ns, packet)
-        self._num_packets += 1
-        if turn is not None:
-            self._num_packets = 0
-            ended_ns = turn[-1][0]
-            return VelodynePoints(turn, self._sensor, self._where, (ended_ns, "")).timed(), ended_ns
-        if self._num_packets > MAX_PACKETS:
-            self.reset()
-            raise InputError(f"{MAX_PACKETS} packets, and the sensor has not turned round.")
-        return None
+        if self._batcher.num_dropped > num_dropped:
+            raise InputError(
+                f"{self._batcher.num_dropped - num_dropped} packets before this one, and the sensor has not "
+                "turned half round."
+            )
+        if turn is None:
+            return None
+        ended_ns = turn[-1][0]
+        return VelodynePoints(turn, self._sensor, self._where, (ended_ns, "")).timed(), ended_ns
 
 
 def _sweep(points: TimedPoints, ended_ns: int, frame: int) -> LiveSweep:
@@ -166,6 +165,8 @@ def _sensor_of(address: UdpAddress) -> VelodyneSensor:
     models = require("velodyne_decoder", extra="velodyne", what="Velodyne packets").Model.__members__
     if address.model is not None and address.model not in models:
         raise InputError(f"model {address.model} is not known; name one of {', '.join(models)}.")
+    if address.calibration is None and (address.model or "").startswith("HDL64E"):
+        raise InputError(f"model {address.model}: its lasers differ from unit to unit; name a calibration.")
     if address.calibration is None:
         return VelodyneSensor(address.model)
     calibrated = read_calibrated_sensor(address.calibration)

@@ -196,7 +196,8 @@ def _standing(winner: Candidate, cluster: Cluster, config: VehicleConfig) -> tup
     if not config.neighbourhood:
         return cluster.bottom_m, cluster.top_m - cluster.bottom_m
     prior = config.classes[winner.hypothesis.label]
-    return 0.0, float(max(winner.around.top + config.top_margin_m, prior.min_box_height_m))
+    least = max(prior.min_box_height_m, prior.height_m if winner.is_cut else 0.0)
+    return 0.0, float(max(winner.around.top + config.top_margin_m, least))
 
 
 def _count_points(found: Found, config: DetectorConfig) -> dict[str, Any]:

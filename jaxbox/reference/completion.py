@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, Scalar, VehicleConfig
-from jaxbox.reference.evidence import cast_rays
+from jaxbox.reference.evidence import cast_rays, closed_free_length
 from jaxbox.reference.state import (
     ClassHypothesis,
     Cluster,
@@ -162,6 +162,7 @@ def complete_box(
                 continue
             boxes = place_widths(sides, prior)
             rays = cast_rays(evidence, boxes, num_rays=config.num_rays)
+            rays = dataclasses.replace(rays, free_length=closed_free_length(rays, prior))
             agreement = point_agreement(boxes, xy, config)
             placement, objective = choose_placement(rectangle.score, agreement, rays, config)
             if best is None or objective > best.objective:

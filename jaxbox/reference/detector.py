@@ -69,7 +69,9 @@ def detect(
     if seen is not None:
         boxes = np.array([box.box for box in completed.boxes]).reshape(-1, 5)
         rays = evidence.weigh_boxes(seen, boxes, num_rays=config.completion.num_final_rays)
-    candidates = scoring.score_boxes(completed, rays, clusters, obstacles, config)
+    steepest = None if seen is None else seen.steepest
+    reach = functools.partial(scoring.reach_of_beams, steepest=steepest, elevation=elevation)
+    candidates = scoring.score_boxes(completed, rays, reach, clusters, obstacles, config)
     kept = scoring.keep_best(candidates, config.vehicles)
     # 3.5 Descriptors, and the counts.
     owned, owner = assembly.assign_points(kept, obstacles, clusters)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy import ndimage
 
-from jaxbox.config import EvidenceConfig
+from jaxbox.config import ClassPrior, EvidenceConfig
 from jaxbox.reference.state import Evidence, Ground, RayFractions, Sweep
 
 SUPPORT_HALF_M = 100
@@ -30,6 +30,10 @@ FREE_BEHIND_M = 0.3
 """Free space counts from this far behind the entry,"""
 FREE_BEFORE_M = 0.2
 """up to this far before the exit."""
+LEAST_RISE, RISES_PER_UNIT, NUM_RISES = 0.03, 200, 64
+"""Rises of beams are counted from the first on, in levels of .005."""
+NUM_STEEPEST, STEEP_FROM_M = 30, 8.0
+"""So many points, farther than this, are of the highest beam."""
 
 
 GroundElevation = Callable[[np.ndarray], np.ndarray]
@@ -101,7 +105,32 @@ def build_evidence(
     np.add.at(steps, (azimuth[passes], first[passes]), 1)
     np.add.at(steps, (azimuth[passes], last[passes]), -1)
     free = np.cumsum(steps, axis=1) > 0
-    return Evidence(_sums_before(hits), _sums_before(free), support, range_cell_m)
+    steepest = steepest_beam(xyz[:, 2], rho)
+    return Evidence(_sums_before(hits), _sums_before(free), support, steepest, range_cell_m)
+
+
+def steepest_beam(z: np.ndarray, rho: np.ndarray) -> float:
+    """The rise that 30 points farther than 8 m have or exceed, and at least .03: that of the highest beam.
+
+    Args:
+      z: (n,) m, sensor frame.
+      rho: (n,) m.
+
+    Returns:
+      m/m, to within a level of .005, in which rises count as evenly spread; at most the last level's end.
+
+    >>> round(steepest_beam(np.full(30, 1.02), np.full(30, 10.0)), 3)
+    0.1
+    """
+    rise = z[rho > STEEP_FROM_M] / rho[rho > STEEP_FROM_M]
+    edges = LEAST_RISE + np.arange(NUM_RISES + 1) / RISES_PER_UNIT
+    counts, _ = np.histogram(np.clip(rise[rise >= LEAST_RISE], None, edges[-1]), edges)
+    left = NUM_STEEPEST
+    for count, low, high in zip(counts[::-1], edges[-2::-1], edges[:0:-1], strict=True):
+        if count >= left:
+            return float(high - (high - low) * left / count)
+        left -= count
+    return LEAST_RISE
 
 
 def first_returns(evidence: Evidence | None, config: EvidenceConfig) -> np.ndarray:
@@ -253,6 +282,20 @@ def cast_rays(evidence: Evidence, boxes: np.ndarray, *, num_rays: int) -> RayFra
         deep=deep.sum(axis=1) / total,
         free_length=free.sum(axis=1) / np.maximum(length.sum(axis=1), 1),
     )
+
+
+def closed_free_length(rays: RayFractions, prior: ClassPrior) -> np.ndarray:
+    """The free space that speaks against a class: not that behind hits where beams pass below the body.
+
+    Args:
+      rays: (B,) fractions.
+      prior: `open_below` is the share that does not count.
+
+    Returns:
+      (B,).
+    """
+    beside = np.minimum(rays.free_length, rays.free)
+    return rays.free_length + float(prior.open_below) * (beside - rays.free_length)
 
 
 def _ray_angles(boxes: np.ndarray, num_rays: int) -> np.ndarray:

@@ -30,6 +30,10 @@ SUPPORT_LEVELS = 12
 """Two levels are compared with this many from the lower of them up."""
 SENSOR_LEVELS, PLANE_LEVELS = range(-100, 28), range(-13, 11)
 """Levels about the sensor, and about the plane."""
+SHEET_HALF_M, SHEET_REACH, MIN_SHEET_SQUARES = 40.0, 2, 17
+"""Sheets are looked for this near, in windows of 5 x 5 squares of which so many are not empty."""
+SHEET_STEP_M = 0.2
+"""Cells of a square that is on a sheet are on it, too, up to this above it."""
 MIN_PLANE_POINTS = 3
 """A plane has three degrees of freedom."""
 
@@ -306,8 +310,60 @@ def fit_ground_surface(xyz: np.ndarray, planes: np.ndarray, config: GroundConfig
     step = float(config.max_grade * cell_m)
     envelope = _lower_envelope(lowest, step=step, num_rounds=config.num_envelope_rounds)
     # Empty cells are inf on both sides, which is not below.
-    valid = lowest < envelope + config.envelope_margin_m
+    valid = (lowest < envelope + config.envelope_margin_m) | on_sheets(lowest, config)
     return _fill_and_smooth(lowest, valid, sigma=float(config.smoothing_m / cell_m))
+
+
+def on_sheets(lowest: np.ndarray, config: GroundConfig) -> np.ndarray:
+    """Cells that lie on a smooth sheet of 5 x 5 squares of 2 x 2 cells, such as a ramp.
+
+    Args:
+      lowest: (X, Y) m above the plane, infinite where a cell is empty.
+      config: how far the lowest of the squares may deviate from their plane in the mean, and the steepest.
+
+    Returns:
+      (X, Y) bool; none farther than 40 m along x or y.
+    """
+    reach = min(len(lowest) // 2, round(SHEET_HALF_M / config.surface_cell_m))
+    middle = slice(len(lowest) // 2 - reach, len(lowest) - len(lowest) // 2 + reach)
+    near = lowest[middle, middle]
+    padded = np.pad(near, (0, -len(near) % POOL_CELLS), constant_values=np.inf)
+    size = len(padded) // POOL_CELLS
+    square = padded.reshape(size, POOL_CELLS, size, POOL_CELLS).min(axis=(1, 3))
+    num, level, rise, rms = planes_through_windows(square)
+    sheet = (num >= MIN_SHEET_SQUARES) & (rms < config.sheet_tolerance_m)
+    sheet &= rise < config.max_sheet_grade * POOL_CELLS * config.surface_cell_m
+    sheet &= np.abs(square - level) < SHEET_STEP_M / 2
+    above = np.kron(np.where(sheet, level, -np.inf), np.ones((POOL_CELLS, POOL_CELLS)))
+    found = np.zeros(lowest.shape, bool)
+    found[middle, middle] = near < above[: len(near), : len(near)] + SHEET_STEP_M
+    return found
+
+
+def planes_through_windows(square: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Least-squares planes through windows of 5 x 5 squares round each.
+
+    Args:
+      square: (S, S) m, infinite where there is nothing.
+
+    Returns:
+      Squares with anything in them; height m of the plane in the middle; its rise, m a square; and the root
+      mean square deviation, m; each (S, S). Without three squares of one plane: 0, infinity, and 0.
+    """
+    offset = np.arange(-SHEET_REACH, SHEET_REACH + 1)
+    x, y = (axis.ravel() for axis in np.meshgrid(offset, offset, indexing="ij"))
+    around = np.pad(square, SHEET_REACH, constant_values=np.inf)
+    windows = np.lib.stride_tricks.sliding_window_view(around, (len(offset), len(offset)))
+    windows = windows.reshape(*square.shape, -1)
+    there = np.isfinite(windows)
+    level, rise, rms = np.zeros(square.shape), np.full(square.shape, np.inf), np.zeros(square.shape)
+    for place in zip(*np.nonzero(there.sum(axis=-1) >= MIN_PLANE_POINTS), strict=True):
+        design = np.column_stack([x, y, np.ones_like(x)])[there[place]]
+        fit, _, rank, _ = np.linalg.lstsq(design, windows[place][there[place]], rcond=None)
+        if rank == MIN_PLANE_POINTS:
+            level[place], rise[place] = fit[2], np.hypot(*fit[:2])
+            rms[place] = np.sqrt(np.mean((design @ fit - windows[place][there[place]]) ** 2))
+    return there.sum(axis=-1), level, rise, rms
 
 
 def _lower_envelope(lowest: np.ndarray, *, step: float, num_rounds: int) -> np.ndarray:

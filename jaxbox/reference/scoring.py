@@ -1,13 +1,14 @@
 """Vehicle decision: the score of a box, what surrounds it, and non-maximum suppression."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 from scipy.special import expit
 
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, Scalar, VehicleConfig
+from jaxbox.reference.evidence import GroundElevation, closed_free_length
 from jaxbox.reference.state import (
     Candidate,
     ClassHypothesis,
@@ -22,6 +23,8 @@ from jaxbox.reference.state import (
 
 PSEUDO_COUNT = 5
 """Pseudo-count: upper points that are added, with the share of the full score behind the faces."""
+CUT_SLACK_M = 0.1
+"""Tops from so much below the highest beam on are more and more taken to be cut off by it."""
 NUM_LEVELS = 20
 """Levels of height by which the top is found."""
 SIDE_DEPTHS_M = -0.15, 0.35
@@ -37,6 +40,7 @@ MAX_END_MARGIN_M = 0.4
 def score_boxes(
     completed: Completed,
     rays: tuple[RayFractions, np.ndarray] | None,
+    reach: Callable[[np.ndarray], float],
     clusters: Sequence[Cluster],
     obstacles: Obstacles,
     config: DetectorConfig,
@@ -46,6 +50,7 @@ def score_boxes(
     Args:
       completed: q boxes.
       rays: what the rays over each box met, and the ground support round it; None without evidence.
+      reach: how high the highest beam is where a box (5,) begins, m, see `reach_of_beams`.
       clusters: of all maps.
       obstacles: all points above the ground.
       config: of the detector.
@@ -58,7 +63,8 @@ def score_boxes(
         cluster, prior = clusters[hypothesis.cluster], config.vehicles.classes[hypothesis.label]
         hit, free_length, support = 1.0, 0.0, None
         if rays is not None:
-            hit, free_length, support = (float(a[row]) for a in (rays[0].hit, rays[0].free_length, rays[1]))
+            free = closed_free_length(rays[0], prior)
+            hit, free_length, support = (float(a[row]) for a in (rays[0].hit, free, rays[1]))
         early = early_score(
             box,
             prior,
@@ -70,17 +76,34 @@ def score_boxes(
         )
         around = _look_around(box.box, prior, cluster, early, obstacles, config.vehicles)
         rho = float(np.hypot(box.box[0], box.box[1]))
-        score = early * neighbourhood_score(around, rho, prior, config.vehicles)
         if config.vehicles.neighbourhood and config.completion.mode != "none":
             beam_angle = 2 * np.pi / config.evidence.num_azimuths
             seen = end_where_seen(box.box, around, float(prior.length_m), config.completion, beam_angle)
             box = dataclasses.replace(box, box=seen)
-        return Candidate(hypothesis, box, around, score)
+        late, is_cut = neighbourhood_score(around, rho, reach(box.box), prior, config.vehicles)
+        return Candidate(hypothesis, box, around, is_cut, early * late)
 
     pairs = zip(completed.hypotheses, completed.boxes, strict=True)
     candidates = [judge(row, *pair) for row, pair in enumerate(pairs)]
     candidates = [candidate for candidate in candidates if candidate.score > config.vehicles.min_score]
     return sorted(candidates, key=lambda candidate: -candidate.score)
+
+
+def reach_of_beams(box: np.ndarray, steepest: float | None, elevation: GroundElevation) -> float:
+    """How high the highest beam is where a box begins.
+
+    Args:
+      box: (5,): x, y, length, width in m and yaw in rad.
+      steepest: rise of that beam, m/m; None where nothing is known of it.
+      elevation: z of the ground, m, under points.
+
+    Returns:
+      m above the ground under the middle of the box; infinite where nothing is known.
+    """
+    if steepest is None:
+        return np.inf
+    nearest = np.hypot(*box[:2]) - box[2] / 2
+    return float(steepest * nearest - elevation(np.array([[*box[:2], 0.0]]))[0])
 
 
 def _look_around(
@@ -320,6 +343,7 @@ def score_box(
     free_length: float,
     support: float | None,
     config: VehicleConfig,
+    reach: float = np.inf,
 ) -> float:
     """How much a box looks like a vehicle of a class: a product of factors in [0, 1].
 
@@ -332,6 +356,7 @@ def score_box(
       free_length: share of the box seen to be free.
       support: ground points round the box, or None where they were not counted.
       config: of the score.
+      reach: m above the ground, height of the highest beam where the box begins.
 
     Returns:
       The score; 0 where a gate of the class closes.
@@ -346,7 +371,7 @@ def score_box(
         config=config,
     )
     rho = float(np.hypot(box.box[0], box.box[1]))
-    return early * neighbourhood_score(around, rho, prior, config)
+    return early * neighbourhood_score(around, rho, reach, prior, config)[0]
 
 
 def early_score(
@@ -417,26 +442,32 @@ def size_score(size: np.ndarray, prior: ClassPrior) -> float:
 
 
 def neighbourhood_score(
-    around: NeighbourhoodCounts, rho: float, prior: ClassPrior, config: VehicleConfig
-) -> float:
+    around: NeighbourhoodCounts, rho: float, reach: float, prior: ClassPrior, config: VehicleConfig
+) -> tuple[float, bool]:
     """The part of the score that the points in and round the box decide.
 
     Args:
       around: see `count_points_around`.
       rho: m, range of the box: it may be higher than its top by `top_grade` times this.
+      reach: m above the ground: where the box begins, the highest beam passes there, and cuts off what is
+        higher. A top that comes near to it may lie anywhere above, for `cut_score` of the score.
       prior: of the class.
       config: exp(-(ring weight x ring + overhead weight x above) / inside), and a factor from
         `upright_score`, where no upper point is recessed, to 1 from the share `recess_share` on. Points above
         do not count where the top is twice `overhead_gap_m` below `count_max_height_m`.
 
     Returns:
-      In [0, 1]; 0 where a gate of the class closes.
+      In [0, 1], 0 where a gate of the class closes; and whether it is that of a box that is cut off.
     """
     highest = around.top + config.top_grade * rho
-    if not (prior.min_height_m < highest and around.top < prior.max_height_m):
-        return 0.0
-    height = min(max(prior.height_m, around.top), highest)
-    score = asymmetric_gaussian(height, prior.height_m, prior.height_below_m, prior.height_above_m)
+    widths = prior.height_m, prior.height_below_m, prior.height_above_m
+    seen = cut = 0.0
+    if prior.min_height_m < highest and around.top < prior.max_height_m:
+        seen = asymmetric_gaussian(min(max(prior.height_m, around.top), highest), *widths)
+    if prior.min_cut_height_m < around.top < prior.max_height_m:
+        share = min(max(1 + (around.top - reach) / CUT_SLACK_M, 0.0), 1.0)
+        cut = float(config.cut_score * share) * asymmetric_gaussian(max(prior.height_m, around.top), *widths)
+    score = max(seen, cut)
     gap = prior.count_max_height_m - highest
     connected = min(max(2 - gap / config.overhead_gap_m, 0.0), 1.0)
     clutter = config.ring_weight * around.num_ring + config.overhead_weight * connected * around.num_above
@@ -444,7 +475,7 @@ def neighbourhood_score(
     share = around.num_recessed + PSEUDO_COUNT * config.recess_share
     share = share / (around.num_upper + PSEUDO_COUNT)
     upright = config.upright_score + (1 - config.upright_score) * min(1.0, share / config.recess_share)
-    return float(score * upright)
+    return float(score * upright), cut > seen
 
 
 def bev_iou(first: np.ndarray, second: np.ndarray) -> float:

@@ -122,6 +122,8 @@ class Evidence:
     """(azimuths, ranges + 1) int: free range cells before."""
     support: np.ndarray
     """(200, 200) int: ground points in the 7 x 7 cells of 1 m round each."""
+    steepest: float
+    """Rise of the highest beam, m/m."""
     range_cell_m: float
     """Length of a range cell."""
 
@@ -209,6 +211,8 @@ class Candidate:
     """The box."""
     around: NeighbourhoodCounts
     """Points in and round it."""
+    is_cut: bool
+    """Whether its top is out of sight, above the highest beam."""
     score: float
     """In [0, 1]."""
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.config import ClassPrior
+from jaxbox.stages.state import RayFractions
 
 
 def prior_of(classes: Sequence[ClassPrior], label: jax.Array) -> ClassPrior:
@@ -45,6 +46,21 @@ def asymmetric_gaussian(
       The same shape, in [0, 1].
     """
     return jnp.exp(-(((value - peak) / jnp.where(value < peak, below, above)) ** 2))
+
+
+def closed_free_length(rays: RayFractions, prior: ClassPrior) -> jax.Array:
+    """The free space in boxes that speaks against a class: beams also pass below the bodies of some.
+
+    Args:
+      rays: fractions (..., P).
+      prior: fields of (P,) float32.
+
+    Returns:
+      (..., P) float32: the free length of all rays, or no more than the fraction that hit nothing.
+    """
+    beside = jnp.minimum(rays.free_length, rays.free)
+    share = jnp.broadcast_to(prior.open_below, beside.shape)
+    return rays.free_length + share * (beside - rays.free_length)
 
 
 def size_score(length: jax.Array, width: jax.Array, prior: ClassPrior) -> jax.Array:

@@ -1,6 +1,5 @@
 """What surrounds a box: the points of the whole sweep in it, above it and round it."""
 
-import dataclasses
 import math
 from collections.abc import Sequence
 
@@ -8,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.config import ClassPrior, RegionConfig, VehicleConfig
-from jaxbox.stages.state import Obstacles
+from jaxbox.stages.state import NeighbourhoodCounts, Obstacles
 from jaxbox.xla import chunks
 from jaxbox.xla.loops import map_rows
 from jaxbox.xla.rows import sum_after
@@ -38,51 +37,6 @@ LOWEST_LEVEL = 0.4
 SIDE_DEPTH_M, SIDE_HALF_M = 0.1, 0.25
 """Points beyond the far end whose depth behind the long side that the sensor sees is the first, give or take
 the second, go on along that side: they are of what the box holds a part of."""
-
-
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class NeighbourhoodCounts:
-    """Points in and round each box."""
-
-    rows: jax.Array
-    """(P, 7) float32: what follows, in that order."""
-
-    @property
-    def num_inside(self) -> jax.Array:
-        """(P,) points of vehicle height inside, give or take the margin."""
-        return self.rows[:, 0]
-
-    @property
-    def top(self) -> jax.Array:
-        """(P,) m above the ground: as high as all but a few of them; 0 where there are none."""
-        return self.rows[:, 1]
-
-    @property
-    def num_above(self) -> jax.Array:
-        """(P,) points higher than the vehicle, within the box."""
-        return self.rows[:, 2]
-
-    @property
-    def num_ring(self) -> jax.Array:
-        """(P,) points of vehicle height just outside, but for those behind the box."""
-        return self.rows[:, 3]
-
-    @property
-    def num_upper(self) -> jax.Array:
-        """(P,) those inside that are as high as glass, bonnet and roof."""
-        return self.rows[:, 4]
-
-    @property
-    def num_recessed(self) -> jax.Array:
-        """(P,) those of them that lie behind the faces which the sensor sees."""
-        return self.rows[:, 5]
-
-    @property
-    def deepest(self) -> jax.Array:
-        """(P,) m: how far behind the near end the farthest of all points of vehicle height inside lies, those
-        behind hidden faces too."""
-        return self.rows[:, 6]
 
 
 def count_points_around(

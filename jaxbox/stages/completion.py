@@ -23,7 +23,7 @@ from jaxbox.stages._assignments import (
     longer_side,
     place,
 )
-from jaxbox.stages._priors import prior_of
+from jaxbox.stages._priors import closed_free_length, prior_of
 from jaxbox.stages.state import (
     NOT_A_BOX,
     Boxes,
@@ -205,15 +205,17 @@ def _judge_assignments(
     entry, num = _largest_first(hypotheses, candidates, points, config.vehicles)
     num_entries, entry = entry.shape[0], entry[: config.completion.max_assignments]
 
-    def prepare(entry: jax.Array) -> tuple[Placements, jax.Array, jax.Array]:
+    def prepare(entry: jax.Array) -> tuple[Placements, jax.Array, jax.Array, jax.Array]:
         hypothesis, number = split_index(entry, num_each)
         cluster, label = take(hypotheses.cluster, hypothesis), take(hypotheses.label, hypothesis)
         sides = _assign(candidates, number, cluster)
-        return place_widths(sides, prior_of(config.vehicles.classes, label)), sides.score, cluster
+        return place_widths(sides, prior_of(config.vehicles.classes, label)), sides.score, cluster, label
 
-    def judge(rows: tuple[Placements, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        boxes, score, cluster = rows
+    def judge(rows: tuple[Placements, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        boxes, score, cluster, label = rows
         rays = cast_rays(boxes, num_rays=config.completion.num_rays)
+        closed = closed_free_length(rays, prior_of(config.vehicles.classes, label))
+        rays = dataclasses.replace(rays, free_length=closed)
         agreement = point_agreement(boxes, *points.table(cluster), config.completion)
         return choose_placement(score, agreement, rays, config.completion)
 

@@ -14,7 +14,7 @@ from jaxbox.xla import chunks
 from jaxbox.xla.arithmetic import arctan2, cos_sin
 from jaxbox.xla.loops import apply_in_turn, fast_axis, map_rows
 from jaxbox.xla.range_bits import draw_beams, next_set, set_before, words_at
-from jaxbox.xla.rows import lookup
+from jaxbox.xla.rows import lookup, sum_after
 
 SUPPORT_HALF_M = 100.0
 """The ground support grid covers |x|, |y| below this, in cells of 1 m."""
@@ -46,6 +46,16 @@ MIN_DROP_M = 1e-3
 
 ENDS_AT_RETURN = 1 - 1e-6
 """From this fraction of its way on, the free part of a beam ends at the return itself."""
+
+
+LEAST_RISE, RISES_PER_UNIT, NUM_RISES = 0.03, 200, 64
+"""Rises of beams are counted from the first on, in that many levels of .005. Every sensor has a beam that
+rises at least so much, and those that rise beyond the last, 19 degrees, cut no vehicle off."""
+
+
+NUM_STEEPEST, STEEP_FROM_M = 30, 8.0
+"""So many points rise as much as the highest beam, a few strays apart. Nearer ones say less: the lasers of a
+sensor are some centimetres above or below its origin."""
 
 
 MIN_SLOPE = 1e-9
@@ -134,8 +144,32 @@ def build_evidence(
         free=free,
         hit=hit,
         support=_ground_support(xyz, height, mask, config.support_height_m),
+        steepest=steepest_beam(xyz[:, 2], rho, mask),
         num_ranges=num_ranges,
     )
+
+
+def steepest_beam(z: jax.Array, rho: jax.Array, mask: jax.Array) -> jax.Array:
+    """The rise of the highest beam, as far as points show it.
+
+    Args:
+      z: (N,) float32, m, sensor frame.
+      rho: (N,) float32, m.
+      mask: (N,) bool, points that count.
+
+    Returns:
+      () float32, m/m: what 30 points exceed, and at least .03.
+
+    Reference: oracle `jaxbox.reference.steepest_beam`.
+    """
+    level = jnp.floor((z / jnp.maximum(rho, STEEP_FROM_M) - LEAST_RISE) * RISES_PER_UNIT).astype(jnp.int32)
+    counted = mask & (rho > STEEP_FROM_M) & (level >= 0)
+    place = jnp.where(counted, jnp.minimum(level, NUM_RISES - 1), NUM_RISES)
+    count = jnp.zeros(NUM_RISES, jnp.int32).at[place].add(1, mode="drop").astype(jnp.float32)
+    higher = sum_after(count[None])[0]
+    share = jnp.clip((NUM_STEEPEST - higher) / jnp.maximum(count, 1), 0, 1)
+    top = jnp.arange(1, NUM_RISES + 1, dtype=jnp.float32) - share
+    return LEAST_RISE + jnp.max(jnp.where(higher + count >= NUM_STEEPEST, top, 0)) / RISES_PER_UNIT
 
 
 def first_returns(evidence: Evidence | None, config: EvidenceConfig) -> jax.Array:

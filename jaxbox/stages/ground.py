@@ -13,6 +13,7 @@ from jaxbox.config.capacities import obstacle_capacity
 from jaxbox.config.schema import GROUND_CANDIDATE_CELL_M
 from jaxbox.geometry.planar import plane_residual
 from jaxbox.stages._grids import sum_of_neighbours
+from jaxbox.stages._sheets import on_sheets
 from jaxbox.stages.state import Ground, Obstacles, Sweep
 from jaxbox.types import GroundPlane
 from jaxbox.xla import chunks
@@ -389,6 +390,7 @@ def fit_ground_surface(xyz: jax.Array, mask: jax.Array, planes: jax.Array, confi
     lowest = jnp.full(n * n, jnp.inf, jnp.float32).at[cell].min(height, mode="drop").reshape(n, n)
     envelope = _lower_envelope(lowest, config.max_grade * cell_m, config.num_envelope_rounds)
     ground = jnp.isfinite(lowest) & (lowest < envelope + config.envelope_margin_m)
+    ground = ground | on_sheets(lowest, config)
     return _smooth(jnp.where(ground, lowest, 0), ground.astype(jnp.float32), config.smoothing_m / cell_m)
 
 

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, VehicleConfig
 from jaxbox.geometry.planar import rectangle_iou, wrap_yaw
 from jaxbox.stages._assignments import SEEN_RAMP
-from jaxbox.stages._priors import asymmetric_gaussian, prior_of, size_score
-from jaxbox.stages._surroundings import NeighbourhoodCounts, cluster_alone, count_points_around
+from jaxbox.stages._priors import asymmetric_gaussian, closed_free_length, prior_of, size_score
+from jaxbox.stages._surroundings import cluster_alone, count_points_around
 from jaxbox.stages.state import (
     NOT_A_BOX,
     Boxes,
@@ -21,6 +21,7 @@ from jaxbox.stages.state import (
     Completed,
     GroundElevation,
     Kept,
+    NeighbourhoodCounts,
     Obstacles,
     RayFractions,
 )
@@ -32,6 +33,11 @@ from jaxbox.xla.suppression import suppress_conflicts
 PSEUDO_COUNT = 5
 """Upper points that are added before the share behind the faces is taken, at the share of the full score, so
 that a few points cannot give an extreme share."""
+
+
+CUT_SLACK_M, NOT_CUT_M = 0.1, 1e6
+"""Tops from so much below the highest beam on are cut off by it, less so the lower they are; and where it
+passes when nothing is known of it."""
 
 
 INSIDE_TOLERANCE_M = 1e-3
@@ -49,6 +55,7 @@ def score_boxes(
     obstacles: Obstacles,
     ground_elevation: GroundElevation,
     lowest_z: jax.Array | None,
+    steepest: jax.Array | None,
     config: DetectorConfig,
 ) -> Candidates:
     """Scores the boxes by rays and size, then the best of them by what surrounds them.
@@ -61,6 +68,7 @@ def score_boxes(
       ground_elevation: asks for the ground under points.
       lowest_z: (P,) float32, m, of each cluster's points: it tells which of several planes a vehicle stands
         on; None with one plane.
+      steepest: () float32, m/m, rise of the highest beam: it may cut vehicles off; None without evidence.
       config: of the detector.
 
     Returns:
@@ -83,10 +91,15 @@ def score_boxes(
     around = _look_around(rectangle, label, cluster, early, num, clusters, obstacles, config)
 
     def finish(rows: tuple[Any, ...]) -> Candidates:
-        candidates = _finish(rows, clusters, config)
-        z = jnp.zeros_like(candidates.bottom) if lowest_z is None else take(lowest_z, candidates.cluster)
-        place = jnp.concatenate([candidates.rectangle[:, :2], z[:, None]], axis=1)
-        return dataclasses.replace(candidates, bottom=candidates.bottom + ground_elevation(place))
+        rectangle, label, cluster, early, around = rows
+        if config.vehicles.neighbourhood and config.completion.mode != "none":
+            rectangle = _end_where_seen(rectangle, label, around, config)
+        z = jnp.zeros_like(rectangle[:, 0]) if lowest_z is None else take(lowest_z, cluster)
+        ground = ground_elevation(jnp.concatenate([rectangle[:, :2], z[:, None]], axis=1))
+        nearest = jnp.linalg.norm(rectangle[:, :2], axis=1) - rectangle[:, 2] / 2
+        reach = NOT_CUT_M * jnp.ones_like(ground) if steepest is None else steepest * nearest - ground
+        candidates = _finish((rectangle, label, cluster, early, around), reach, clusters, settings)
+        return dataclasses.replace(candidates, bottom=candidates.bottom + ground)
 
     candidates = map_rows(finish, (*picked, around), num_rows=num)
     order = best_first(candidates.score, num)
@@ -110,8 +123,10 @@ def _early_scores(
         if rays is not None:
             hit, free_length, support = rays[0].hit, rays[0].free_length, rays[1]
         num_points = take(clusters.num_points, cluster)
-        by_evidence = evidence_score(num_points, hit, free_length, support, boxes.objective, config)
         prior = prior_of(config.classes, label)
+        if rays is not None:
+            free_length = closed_free_length(rays[0], prior)
+        by_evidence = evidence_score(num_points, hit, free_length, support, boxes.objective, config)
         by_size = size_score(boxes.length, boxes.width, prior)
         score = by_evidence * by_size * prior.prior_weight
         large_enough = jnp.max(boxes.measured, axis=1) >= config.min_extent_m
@@ -142,16 +157,22 @@ def _look_around(
     return count_points_around(rectangle, prior, sure, num, obstacles, config.vehicles, config.region)
 
 
-def _finish(rows: tuple[Any, ...], clusters: Clusters, settings: DetectorConfig) -> Candidates:
-    """Candidates with their score, length and height, bottoms above the ground, as they came in."""
+def _end_where_seen(
+    rectangles: jax.Array, label: jax.Array, around: NeighbourhoodCounts, config: DetectorConfig
+) -> jax.Array:
+    usual_m = prior_of(config.vehicles.classes, label).length_m
+    beam_angle = 2 * math.pi / config.evidence.num_azimuths
+    return end_where_seen(rectangles, around, usual_m, config.completion, beam_angle)
+
+
+def _finish(rows: tuple[Any, ...], reach: jax.Array, clusters: Clusters, config: VehicleConfig) -> Candidates:
+    """Candidates with their score and height, bottoms above the ground, in the order that they came in."""
     rectangle, label, cluster, score, around = rows
-    config = settings.vehicles
     prior = prior_of(config.classes, label)
-    late = neighbourhood_score(around, jnp.linalg.norm(rectangle[:, :2], axis=1), prior, config)
-    if config.neighbourhood and settings.completion.mode != "none":
-        beam_angle = 2 * math.pi / settings.evidence.num_azimuths
-        rectangle = end_where_seen(rectangle, around, prior.length_m, settings.completion, beam_angle)
+    rho = jnp.linalg.norm(rectangle[:, :2], axis=1)
+    late, is_cut = neighbourhood_score(around, rho, reach, prior, config)
     height = jnp.maximum(around.top + config.top_margin_m, prior.min_box_height_m)
+    height = jnp.where(is_cut, jnp.maximum(height, prior.height_m), height)
     bottom = jnp.zeros_like(height)
     if not config.neighbourhood:
         # The paper keeps the height of the cluster itself.
@@ -265,39 +286,53 @@ def end_where_seen(
 
 
 def neighbourhood_score(
-    around: NeighbourhoodCounts, rho: jax.Array, prior: ClassPrior, config: VehicleConfig
-) -> jax.Array:
+    around: NeighbourhoodCounts, rho: jax.Array, reach: jax.Array, prior: ClassPrior, config: VehicleConfig
+) -> tuple[jax.Array, jax.Array]:
     """The part of the score that the points in and round the box decide.
 
     The true top lies between the top of the points and that plus the beams' spacing; it is compared with the
-    class at the place in between that suits it best.
+    class at the place in between that suits it best. Where the highest beam cuts the box off, it may lie
+    anywhere above: then the height says nothing, and counts less.
 
     Args:
       around: see `count_points_around`.
       rho: (P,) float32, m, range of the box.
+      reach: (P,) float32, m above the ground: height of the highest beam where the box begins.
       prior: fields of (P,) float32.
       config: exp(-(ring weight x ring + overhead weight x above) / inside), and what upright boxes lose:
         those with few upper points come near to the full score. Points above count as far as they are
         connected: from a gap of `overhead_gap_m` on less and less, from twice that on not at all.
 
     Returns:
-      (P,) float32 in [0, 1]; 0 where a gate fails.
+      score: (P,) float32 in [0, 1]; 0 where a gate fails.
+      is_cut: (P,) bool, whether it is that of a box that the highest beam cuts off.
     """
     highest = around.top + config.top_grade * rho
-    plausible = (highest > prior.min_height_m) & (around.top < prior.max_height_m)
-    top = jnp.clip(prior.height_m, around.top, highest)
     clearance = prior.count_max_height_m - highest
     connected = jnp.clip(2 - clearance / config.overhead_gap_m, 0, 1)
     overhead = config.overhead_weight * connected * around.num_above
     clutter = (config.ring_weight * around.num_ring + overhead) / jnp.maximum(around.num_inside, 1)
-    score = asymmetric_gaussian(top, prior.height_m, prior.height_below_m, prior.height_above_m)
+    score, is_cut = _height_score(around.top, highest, reach, prior, config)
     score = score * jnp.exp(-clutter)
     recessed = around.num_recessed + PSEUDO_COUNT * config.recess_share
     recessed = recessed / (around.num_upper + PSEUDO_COUNT)
     upright = config.upright_score + (1 - config.upright_score) * jnp.minimum(
         recessed / config.recess_share, 1
     )
-    return jnp.where(plausible, score * upright, 0)
+    return score * upright, is_cut
+
+
+def _height_score(
+    top: jax.Array, highest: jax.Array, reach: jax.Array, prior: ClassPrior, config: VehicleConfig
+) -> tuple[jax.Array, jax.Array]:
+    """(P,) how well tops suit the class, and whether that is as the highest beam cuts the boxes off."""
+    widths = prior.height_below_m, prior.height_above_m
+    seen = asymmetric_gaussian(jnp.clip(prior.height_m, top, highest), prior.height_m, *widths)
+    seen = jnp.where(highest > prior.min_height_m, seen, 0)
+    cut = config.cut_score * jnp.clip(1 + (top - reach) / CUT_SLACK_M, 0, 1)
+    cut = cut * asymmetric_gaussian(jnp.maximum(prior.height_m, top), prior.height_m, *widths)
+    cut = jnp.where(top > prior.min_cut_height_m, cut, 0)
+    return jnp.where(top < prior.max_height_m, jnp.maximum(seen, cut), 0), cut > seen
 
 
 def non_max_suppression(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | float) -> jax.Array:

@@ -188,6 +188,8 @@ class Evidence:
     that has one (`next_words`)."""
     support: jax.Array
     """(200, 200) float32: ground points in the 7 x 7 m round each 1 m cell."""
+    steepest: jax.Array
+    """() float32: rise of the highest beam, m/m."""
     num_ranges: int = dataclasses.field(metadata={"static": True})
     """static, R: range cells of the grid, the last block's being more."""
 
@@ -292,6 +294,51 @@ class Completed:
     """(Q,) boxes."""
     num_assignments: jax.Array
     """() int32: length-axis assignments that the evidence had to weigh, true number."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class NeighbourhoodCounts:
+    """Points in and round each box."""
+
+    rows: jax.Array
+    """(P, 7) float32: what follows, in that order."""
+
+    @property
+    def num_inside(self) -> jax.Array:
+        """(P,) points of vehicle height inside, give or take the margin."""
+        return self.rows[:, 0]
+
+    @property
+    def top(self) -> jax.Array:
+        """(P,) m above the ground: as high as all but a few of them; 0 where there are none."""
+        return self.rows[:, 1]
+
+    @property
+    def num_above(self) -> jax.Array:
+        """(P,) points higher than the vehicle, within the box."""
+        return self.rows[:, 2]
+
+    @property
+    def num_ring(self) -> jax.Array:
+        """(P,) points of vehicle height just outside, but for those behind the box."""
+        return self.rows[:, 3]
+
+    @property
+    def num_upper(self) -> jax.Array:
+        """(P,) those inside that are as high as glass, bonnet and roof."""
+        return self.rows[:, 4]
+
+    @property
+    def num_recessed(self) -> jax.Array:
+        """(P,) those of them that lie behind the faces which the sensor sees."""
+        return self.rows[:, 5]
+
+    @property
+    def deepest(self) -> jax.Array:
+        """(P,) m: how far behind the near end the farthest of all points of vehicle height inside lies, those
+        behind hidden faces too."""
+        return self.rows[:, 6]
 
 
 @jax.tree_util.register_dataclass

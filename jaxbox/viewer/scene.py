@@ -49,6 +49,8 @@ class View:
     """Whether class and score stand above them."""
     labels: bool = True
     """Whether labelled boxes are drawn."""
+    points: bool = True
+    """Whether points are."""
     tracks: bool = False
     """Whether the boxes are those of tracks, by id, with their trails and velocities."""
     light: bool = False
@@ -62,7 +64,7 @@ class Scene:
     """Arrays of what is drawn, sensor frame."""
 
     points: np.ndarray
-    """(n, 3) float32, m: the frame's own array, so that an unchanged sweep is known by it."""
+    """(n, 3) float32, m: the frame's own array, so that an unchanged sweep is known by it; or none."""
     colors: np.ndarray
     """(n, 3) uint8: of the points."""
     lines: Mapping[str, Lines]
@@ -136,9 +138,12 @@ def build_scene(
     if view.captions:
         captions = _all_captions(boxes if view.boxes else _no_boxes(), vehicles, others, below=compared)
     titles = [Caption(text=title, position=(0.0, 0.0, _TITLE_M))] if title and view.apart_m else []
+    points, colors = frame.xyz[:0], np.zeros((0, 3), np.uint8)
+    if view.points:
+        points, colors = frame.xyz, on_page(COLORINGS[view.coloring](frame, detections, view), view)
     return Scene(
-        points=frame.xyz,
-        colors=on_page(COLORINGS[view.coloring](frame, detections, view), view),
+        points=points,
+        colors=colors,
         lines={
             name: Lines(segments=drawn.segments, color=on_page(drawn.color, view))
             for name, drawn in lines.items()

@@ -9,10 +9,9 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from jaxbox._extras import require
+from jaxbox._loopback import LOOPBACK_NAMES
 from jaxbox.io import InputError
 
-LOOPBACK_NAMES = ("localhost", "127.0.0.1", "::1")
-"""Names by which a browser reaches its own machine, also through a forwarded port."""
 ANY_HOST = ("", "0.0.0.0", "::")
 """Hosts that stand for all addresses of the machine."""
 _CLOSE_CODE = 1008

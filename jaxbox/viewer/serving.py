@@ -5,16 +5,17 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 
 from jaxbox import io
+from jaxbox._loopback import LOOPBACK
 from jaxbox.config import DetectorConfig
 from jaxbox.viewer.drives import TrackMemory, split_drives
 from jaxbox.viewer.frames import Frames
 from jaxbox.viewer.page import ViserPage
 from jaxbox.viewer.server import open_server, page_url, quiet
 from jaxbox.viewer.session import Session
-from jaxbox.viewer.viewer import Side, Viewer, Wanted
+from jaxbox.viewer.viewer import KeepRows, Side, Viewer, Wanted
 
-LOOPBACK = "127.0.0.1"
-"""Reached from this machine only."""
+_SplitDrives = tuple[Sequence[io.Sweep], tuple[Sequence[io.Sweep], ...]]
+"""What `split_drives` answers."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -40,6 +41,7 @@ def open_viewer(
     port: int = 0,
     capacity: int | None = None,
     comparison: Comparison | None = None,
+    keep: KeepRows | None = None,
 ) -> Iterator[tuple[Viewer, str]]:
     """Serves a page while the block runs; in it, `Viewer.run` answers what the page's user asks for.
 
@@ -50,6 +52,7 @@ def open_viewer(
       port: 0 takes a free one.
       capacity: points that a sweep is padded to; None for what it needs.
       comparison: what is shown with it; None for nothing.
+      keep: answers boxes or tracks with those no longer valid that are not shown; None shows all.
 
     Yields:
       The viewer, and the address of its page.
@@ -62,11 +65,14 @@ def open_viewer(
     server = open_server(host=host, port=port)
     try:
         with contextlib.ExitStack() as stack:
-            side = _side(sweeps, capacity, stack)
-            compared = None if comparison is None else _compared_side(comparison, sweeps, capacity, stack)
+            split = split_drives(sweeps)
+            side = _side(split, capacity, stack)
+            compared = None if comparison is None else _compared_side(comparison, split, capacity, stack)
             page = ViserPage(server, wanted, num_sweeps=len(side.session), compares=compared is not None)
             title = "" if comparison is None else comparison.of
-            viewer = Viewer(side.session, page, wanted, tracks=side.tracks, title=title, compared=compared)
+            viewer = Viewer(
+                side.session, page, wanted, tracks=side.tracks, title=title, compared=compared, keep=keep
+            )
             page.connect(viewer)
             yield viewer, page_url(server)
     finally:
@@ -74,16 +80,16 @@ def open_viewer(
             server.stop()
 
 
-def _side(sweeps: Sequence[io.Sweep], capacity: int | None, stack: contextlib.ExitStack) -> Side:
+def _side(split: _SplitDrives, capacity: int | None, stack: contextlib.ExitStack) -> Side:
     """Sweeps with a detector and a memory of tracks, which the stack closes."""
-    ordered, drives = split_drives(sweeps)
+    ordered, drives = split
     tracks = stack.enter_context(contextlib.closing(TrackMemory(drives, capacity=capacity)))
     return Side(session=Session(Frames(ordered, capacity=capacity)), tracks=tracks)
 
 
 def _compared_side(
-    comparison: Comparison, sweeps: Sequence[io.Sweep], capacity: int | None, stack: contextlib.ExitStack
+    comparison: Comparison, split: _SplitDrives, capacity: int | None, stack: contextlib.ExitStack
 ) -> Side:
     is_same = comparison.sweeps is None
-    side = _side(sweeps if comparison.sweeps is None else comparison.sweeps, capacity, stack)
+    side = _side(split if comparison.sweeps is None else split_drives(comparison.sweeps), capacity, stack)
     return dataclasses.replace(side, title=comparison.title, config=comparison.config, same_sweeps=is_same)

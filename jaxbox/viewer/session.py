@@ -29,6 +29,9 @@ class Shown:
 class Session:
     """Sweeps and the detector, with a memory of the last frame and the last answer."""
 
+    detects = True
+    """Whether it reads, compiles and detects itself, and its times are of that."""
+
     def __init__(self, frames: Frames) -> None:
         self._frames = frames
         self._read: tuple[int, Frame] | None = None

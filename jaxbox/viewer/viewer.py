@@ -10,8 +10,9 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
+from jaxbox._box_rows import BoxRows
 from jaxbox.config import DetectorConfig
 from jaxbox.config.fields import preset_config, replace_fields
 from jaxbox.io import InputError
@@ -22,6 +23,7 @@ from jaxbox.viewer.frames import Frame
 from jaxbox.viewer.scene import Scene, View, build_scene
 from jaxbox.viewer.session import Session, Shown
 
+AnyRows = TypeVar("AnyRows", bound=BoxRows[Any])
 SWEEPS_PER_S = 10.0
 """Rate of playing to begin with: that of most sensors."""
 TELL_S = 0.3
@@ -94,6 +96,18 @@ class _Answer:
     problems: list[str]
 
 
+class KeepRows(Protocol):
+    """Which boxes and tracks are shown."""
+
+    def __call__(self, boxes: AnyRows, /) -> AnyRows:
+        """The same rows, of which those that are not shown are no longer valid."""
+        ...
+
+
+def _keep_all(boxes: AnyRows, /) -> AnyRows:
+    return boxes
+
+
 class Page(Protocol):
     """What the loop needs of a page."""
 
@@ -119,9 +133,11 @@ class Viewer:
         tracks: TrackMemory | None = None,
         title: str = "",
         compared: Side | None = None,
+        keep: KeepRows | None = None,
     ) -> None:
         self._session, self._page = session, page
         self._side, self._compared = Side(session=session, tracks=tracks, title=title), compared
+        self._keep: KeepRows = keep if keep is not None else _keep_all
         self._changed = threading.Condition()
         self._wanted = Wanted() if wanted is None else wanted
         self._answered: Wanted | None = None
@@ -242,11 +258,14 @@ class Viewer:
             if not side.session.is_compiled(frame, config):
                 stack.enter_context(self._compiling(side, frame, wanted))
             shown = side.session.detect(frame, config)
+        shown = dataclasses.replace(shown, detections=self._keep(shown.detections))
         if not wanted.view.tracks or side.tracks is None:
             return _Answer(shown=shown, tracked=None, problems=[])
         if not self._track_up_to(side, side.tracks, shown, wanted):
             return None
         tracked, problems = side.tracks.find(wanted.index, config)
+        if tracked is not None:
+            tracked = dataclasses.replace(tracked, tracks=self._keep(tracked.tracks))
         return _Answer(shown=shown, tracked=tracked, problems=problems)
 
     def _frame(self, side: Side, index: int) -> Frame:
@@ -261,13 +280,10 @@ class Viewer:
         title = side.title or (wanted.title if self._compared is not None else "")
         if is_second and side.same_sweeps and not view.apart_m:
             # In the same place, points and labels would be drawn twice.
-            view = dataclasses.replace(view, labels=False)
-        scene = build_scene(
+            view = dataclasses.replace(view, labels=False, points=False)
+        return build_scene(
             frame, answer.shown.detections, view, answer.tracked, title=title, compared=is_second
         )
-        if is_second and side.same_sweeps and not view.apart_m:
-            scene = dataclasses.replace(scene, points=scene.points[:0], colors=scene.colors[:0])
-        return scene
 
     def _track_up_to(self, side: Side, tracks: TrackMemory, shown: Shown, wanted: Wanted) -> bool:
         """Tracks what is missing up to the sweep; False where another wish came meanwhile."""

@@ -53,21 +53,30 @@ def describe(shown: Shown, session: Session, *, index: int, min_score: float) ->
     keep = _keep(shown.detections, min_score)
     total = int(np.asarray(shown.detections.valid).sum())
     noun = "vehicle" if keep.sum() == 1 else "vehicles"
-    times = "time" if session.num_compiles == 1 else "times"
     return _block(
         [
             _heading(frame, index, len(session)),
             f"<b><span data-jaxbox='vehicles'>{int(keep.sum())}</span> {noun}</b>: "
             f"{classes_in_words(np.asarray(shown.detections.label)[keep]) or 'none'}",
             _quiet(f"{total} boxes of any score in the answer"),
-            f"<b><span data-jaxbox='milliseconds'>{shown.detect_s * 1e3:.1f}</span> ms</b> to detect, "
-            f"{frame.read_s * 1e3:.0f} ms to read {frame.num_points:,} points",
-            _quiet(
-                f"compiled <span data-jaxbox='compiles'>{session.num_compiles}</span> {times}, "
-                f"{session.compile_s:.1f} s in all"
-            ),
+            *_times(shown, session),
         ]
     )
+
+
+def _times(shown: Shown, session: Session) -> list[str]:
+    frame = shown.frame
+    taken = f"<b><span data-jaxbox='milliseconds'>{shown.detect_s * 1e3:.1f}</span> ms</b>"
+    if not session.detects:
+        return [f"{taken} from the end of the sweep to its boxes, {frame.num_points:,} points"]
+    times = "time" if session.num_compiles == 1 else "times"
+    return [
+        f"{taken} to detect, {frame.read_s * 1e3:.0f} ms to read {frame.num_points:,} points",
+        _quiet(
+            f"compiled <span data-jaxbox='compiles'>{session.num_compiles}</span> {times}, "
+            f"{session.compile_s:.1f} s in all"
+        ),
+    ]
 
 
 def describe_compared(shown: Shown, scene: Scene, first: Scene, *, is_same_sweep: bool) -> str:
