@@ -252,6 +252,7 @@ def padded(objects: Sequence[Any], calibration: Any) -> Observations:
         "label": np.zeros(CAPACITY, np.int32),
         "num_points": np.ones(CAPACITY, np.int32),
         "extent": np.zeros((CAPACITY, 2), np.float32),
+        "front_log_odds": np.zeros(CAPACITY, np.float32),
         "valid": np.arange(CAPACITY) < num,
         "first_return_m": np.full(8, 1e3, np.float32),
     }

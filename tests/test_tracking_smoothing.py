@@ -172,6 +172,15 @@ def test_a_standing_car_has_no_front_and_one_yaw_for_all_sweeps():
     assert smoothed[0].front_probability == pytest.approx(0.5)
 
 
+def test_the_front_is_by_motion_and_where_a_car_stands_by_its_profile():
+    for speed, sign in ((0.0, -1), (0.0, 1), (10.0, 1)):
+        recording = one_car(speed=speed)
+        recording.seen.front_log_odds[:] = sign * (1.0 if speed == 0 else -9.0)
+        for of_sweep in smooth(*tracked(recording)):
+            np.testing.assert_allclose(np.cos(of_sweep.heading), sign, atol=1e-3)
+            assert of_sweep.front_probability > 0.99
+
+
 def test_an_unseen_length_is_the_tracks_and_the_visible_faces_stay():
     recording = one_car(speed=0.0)
     # In one sweep only the front half was seen, and completed too short.

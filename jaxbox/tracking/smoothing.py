@@ -19,8 +19,10 @@ from jaxbox.tracking.shape import (
     CROSSED_WEIGHT,
     FULL_FRONT_SPEED_MPS,
     MAX_GROWTH,
+    MAX_PROFILE_LOG_ODDS,
     MAX_SIZE_POINTS,
     MAX_YAW_POINTS,
+    PROFILE_CORRELATION,
     SEEN_QUANTILE,
     SEEN_SHARE,
 )
@@ -200,16 +202,17 @@ def _between(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarr
 
 
 def _fronts(
-    yaw: np.ndarray, velocity: np.ndarray, moving: np.ndarray, first_turn: np.ndarray
+    paths: Paths, yaw: np.ndarray, velocity: np.ndarray, moving: np.ndarray, first_turn: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the fronts point, without jumps, and how sure that is, by the motion of the whole track.
+    """Where the fronts point, without jumps, and how sure that is, by motion and profile of the whole track.
 
     Args:
+      paths: I tracks.
       yaw: (I, L) rad, world.
       velocity: (I, L, 2) m/s.
       moving: (I, L) bool.
-      first_turn: (I,) rad, of the sensor in the first sweep: the front of what never moved is taken to point
-        away from that sensor's back.
+      first_turn: (I,) rad, of the sensor in the first sweep: the front of what neither moved nor has a
+        profile is taken to point away from that sensor's back.
 
     Returns:
       heading (I, L) rad, and probability (I,).
@@ -219,8 +222,16 @@ def _fronts(
     heading = heading + (start - heading[:, 0])[:, None]
     along = velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
     votes = np.sum(np.clip(along / FULL_FRONT_SPEED_MPS, -1, 1) * moving, axis=1)
+    votes = votes + _profile_log_odds(paths, heading)
     heading = heading + np.where(votes < 0, np.pi, 0.0)[:, None]
     return heading, 1 / (1 + np.exp(-np.abs(votes)))
+
+
+def _profile_log_odds(paths: Paths, heading: np.ndarray) -> np.ndarray:
+    """(I,): of the front at these headings (I, L), as `shape.profile_log_odds` of all detections."""
+    total = np.sum(paths.front_log_odds * np.cos(paths.yaw - heading), axis=1)
+    log_odds = total / (1 + (paths.hit.sum(axis=1) - 1) * PROFILE_CORRELATION)
+    return np.clip(log_odds, -MAX_PROFILE_LOG_ODDS, MAX_PROFILE_LOG_ODDS)
 
 
 def _smooth_group(
@@ -246,7 +257,7 @@ def _smooth_group(
     first = T_world_sensor[paths.first]
     first_turn = np.arctan2(first[:, 1, 0], first[:, 0, 0])
     moving = paths.valid & (motion != Motion.STANDING)
-    heading, front_probability = _fronts(yaw, velocity, moving, first_turn)
+    heading, front_probability = _fronts(paths, yaw, velocity, moving, first_turn)
     hits = paths.hit.sum(axis=1)
     mean_score = paths.score.sum(axis=1) / hits
     own_score = mean_score[:, None] ** TRACK_SHARE * paths.score ** (1 - TRACK_SHARE)
