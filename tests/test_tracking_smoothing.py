@@ -8,7 +8,16 @@ import pytest
 import traffic
 
 from jaxbox.config import TrackConfig
-from jaxbox.tracking import Motion, Sight, TrackerState, offline_motion, paths, smooth, track_sequence
+from jaxbox.tracking import (
+    Motion,
+    Sight,
+    TrackerState,
+    offline_motion,
+    paths,
+    smooth,
+    smoothing,
+    track_sequence,
+)
 
 CONFIG = TrackConfig()
 NUM_SWEEPS = 60
@@ -179,6 +188,36 @@ def test_the_front_is_by_motion_and_where_a_car_stands_by_its_profile():
         for of_sweep in smooth(*tracked(recording)):
             np.testing.assert_allclose(np.cos(of_sweep.heading), sign, atol=1e-3)
             assert of_sweep.front_probability > 0.99
+
+
+def test_height_and_vertical_place_are_those_of_the_track_also_in_gaps():
+    recording = one_car(speed=2.0, missing=(20, 21))
+    rng = np.random.default_rng(1)
+    recording.seen.size[..., 2] += rng.normal(0, 0.2, recording.seen.size.shape[:2])
+    noise = rng.normal(0, 0.1, recording.seen.size.shape[:2])
+    # It drives uphill.
+    hill = 0.05 * np.arange(len(recording))[:, None]
+    recording.seen.center[..., 2] += hill + noise
+    tracks, seen, poses, times = tracked(recording)
+    smoothed = smooth(tracks, seen, poses, times)
+    heights = {float(of_sweep.size[0, 2]) for of_sweep in smoothed}
+    assert len(heights) == 1
+    assert heights.pop() == pytest.approx(1.5, abs=0.1)
+    # Away from both ends.
+    errors = [float(smoothed[f].center[0, 2]) - hill[f, 0] for f in range(5, len(recording) - 5)]
+    assert np.std(errors) < 0.6 * noise.std()
+    assert abs(np.mean(errors)) < 0.02
+    np.testing.assert_array_equal(smoothed[20].center[0, 2], smoothed[20].filtered_center[0, 2])
+
+
+def test_a_track_of_few_detections_is_believed_less():
+    scores = []
+    for num in (2, 10, 50):
+        tracks, seen, poses, times = tracked(one_car(missing=range(num, 50)))
+        scores.append(float(smooth(tracks, seen, poses, times)[0].score[0]))
+    # Each detection has .8.
+    expected = [0.8 * num / (num + smoothing.BELIEVED_HITS) for num in (2, 10, 50)]
+    np.testing.assert_allclose(scores, expected, rtol=1e-5)
 
 
 def test_an_unseen_length_is_the_tracks_and_the_visible_faces_stay():
