@@ -210,6 +210,25 @@ def test_height_and_vertical_place_are_those_of_the_track_also_in_gaps():
     np.testing.assert_array_equal(smoothed[20].center[0, 2], smoothed[20].filtered_center[0, 2])
 
 
+def test_what_moves_has_the_box_of_its_track_and_what_stands_that_of_the_sweep():
+    for speed, is_own in ((10.0, False), (0.0, True)):
+        recording = one_car(speed=speed)
+        rng = np.random.default_rng(2)
+        shape = recording.seen.size.shape[:2]
+        error = rng.normal(0, 0.1, (*shape, 2))
+        recording.seen.center[..., :2] += error
+        recording.seen.size[..., 0] += rng.normal(0, 0.2, shape)
+        smoothed = smooth(*tracked(recording))[5:-5]
+        truth = recording.seen.center[5:-5, 0, :2] - error[5:-5, 0]
+        center = np.array([of_sweep.center[0, :2] for of_sweep in smoothed])
+        filtered = np.array([of_sweep.filtered_center[0, :2] for of_sweep in smoothed])
+        lengths = {round(float(of_sweep.size[0, 0]), 4) for of_sweep in smoothed}
+        assert (len(lengths) > 1) == is_own
+        assert np.array_equal(center, filtered) == (not is_own)
+        if not is_own:
+            assert np.std(center - truth) < 0.06
+
+
 def test_a_track_of_few_detections_is_believed_less():
     scores = []
     for num in (2, 10, 50):

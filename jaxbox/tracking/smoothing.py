@@ -1,10 +1,10 @@
 """The second pass over a whole recording: what is seen later tells about what was seen before.
 
 Positions are smoothed forward and backward, a track has one size and, where it stands, one yaw, and it goes
-on through short gaps. As in the step, a detection's visible faces stay where its sweep saw them: length and
-width of the track are for the sides that the sweep did not see. Height and vertical place are the track's in
-every sweep, because single ones depend on which beams hit the roof. All is float64 in NumPy, in the world of
-the poses.
+on through short gaps. What moves has the box of its track. Of what stands, as in the step, visible faces stay
+where each sweep saw them: length and width of the track are for the sides that it did not see. Height and
+vertical place are the track's in every sweep, because single ones depend on which beams hit the roof. All is
+float64 in NumPy, in the world of the poses.
 
 Axis letters: I tracks, L moments, F sweeps.
 """
@@ -267,10 +267,11 @@ def _smooth_group(
     z = _smooth_height(paths)[..., None]
     whole = np.broadcast_to(size[:, None], (*yaw.shape, 3))
     shown = np.concatenate([shown, whole[..., 2:]], axis=-1)
-    hit = paths.hit[..., None]
+    # Poses drift by more than the place of what stands is known; what moves is seen from changing sides.
+    is_own = (paths.hit & ~moving)[..., None]
     columns = {
-        "center": np.concatenate([np.where(hit, own, position), z], axis=-1),
-        "size": np.where(hit, shown, whole),
+        "center": np.concatenate([np.where(is_own, own, position), z], axis=-1),
+        "size": np.where(is_own, shown, whole),
         "yaw": yaw,
         "heading": heading,
         "front_probability": np.broadcast_to(front_probability[:, None], yaw.shape),
