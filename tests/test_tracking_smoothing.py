@@ -234,8 +234,10 @@ def test_a_track_of_few_detections_is_believed_less():
     for num in (2, 10, 50):
         tracks, seen, poses, times = tracked(one_car(missing=range(num, 50)))
         scores.append(float(smooth(tracks, seen, poses, times)[0].score[0]))
-    # Each detection has .8.
-    expected = [0.8 * num / (num + smoothing.BELIEVED_HITS) for num in (2, 10, 50)]
+    # Each detection has .8, and so has the track that is in all sweeps.
+    assert scores[-1] == pytest.approx(0.8)
+    few = smoothing.BELIEVED_HITS
+    expected = [0.8 * num / (num + few) * (50 + few) / 50 for num in (2, 10, 50)]
     np.testing.assert_allclose(scores, expected, rtol=1e-5)
 
 

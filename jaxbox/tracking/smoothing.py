@@ -47,7 +47,8 @@ MOVING_DISTANCE_M = 1.5
 TRACK_SHARE = 0.75
 """Share of the track's mean score in the logarithm of a detection's; the rest is its own."""
 BELIEVED_HITS = 4.0
-"""A track of n detections is believed n / (n + this): false alarms last shorter than vehicles."""
+"""A track of n detections is believed n / (n + this), and one of all sweeps wholly: false alarms last shorter
+than vehicles."""
 
 
 def smooth(
@@ -262,7 +263,7 @@ def _smooth_group(
     heading, front_probability = _fronts(paths, yaw, velocity, moving, first_turn)
     hits = paths.hit.sum(axis=1)
     mean_score = paths.score.sum(axis=1) / hits
-    belief = hits / (hits + BELIEVED_HITS)
+    belief = hits / (hits + BELIEVED_HITS) * (1 + BELIEVED_HITS / len(tracks))
     own_score = mean_score[:, None] ** TRACK_SHARE * paths.score ** (1 - TRACK_SHARE)
     z = _smooth_height(paths)[..., None]
     whole = np.broadcast_to(size[:, None], (*yaw.shape, 3))
