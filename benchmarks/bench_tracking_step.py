@@ -135,6 +135,7 @@ def _look(rng: np.random.Generator, xy: np.ndarray, velocity: np.ndarray) -> Obs
         "label": np.zeros(ROWS, np.int32),
         "num_points": rng.integers(1, 500, ROWS, dtype=np.int32),
         "extent": size[:, :2].astype(np.float32),
+        "front_log_odds": rng.normal(2, 1, ROWS).astype(np.float32),
         "valid": valid,
         "first_return_m": np.full(AZIMUTHS, 2 * REACH_M, np.float32),
     }

@@ -109,6 +109,26 @@ def test_a_sequence_has_the_threshold_that_the_others_chose(bench):
     assert [by_sequence[name]["hota"]["hota"] for name in best] == [1.0, 1.0, 0.0]
 
 
+def tracks_of(ids, detections):
+    """Tracks of one sweep, with what a score of wholes reads and changes."""
+    num = len(ids)
+    fields = {field.name: np.zeros(num) for field in dataclasses.fields(Tracks)}
+    fields |= {"id": np.array(ids, int), "detection": np.array(detections, int)}
+    return Tracks(**(fields | {"filtered_yaw": np.full(num, 0.5), "filtered_size": np.ones((num, 3))}))
+
+
+def test_a_whole_track_has_one_score_and_its_own_box(bench):
+    tracks = [tracks_of([4, 7], [1, 0]), tracks_of([7, 4], [0, -1]), tracks_of([4, 9], [0, -1])]
+    scores = [np.array([5.0, 1.0]), np.array([3.0]), np.array([4.0])]
+    so_far = bench.as_wholes(tracks, scores, ahead=False)
+    assert [of_sweep.score.tolist() for of_sweep in so_far] == [[1.0, 5.0], [4.0, 1.0], [2.5, -np.inf]]
+    of_all = bench.as_wholes(tracks, scores, ahead=True)
+    assert [of_sweep.score.tolist() for of_sweep in of_all] == [[2.5, 4.0], [4.0, 2.5], [2.5, -np.inf]]
+    for of_sweep in so_far:
+        assert (of_sweep.heading == 0.5).all()
+        assert (of_sweep.size == 1).all()
+
+
 def test_padded_boxes_are_those_of_the_file_and_nothing_else_is_valid(bench):
     calibration = make_calibration()
     boxes = cars(0)
@@ -121,6 +141,8 @@ def test_padded_boxes_are_those_of_the_file_and_nothing_else_is_valid(bench):
     np.testing.assert_allclose(seen.center[:NUM_CARS], boxes[:, :3], atol=0.02)
     np.testing.assert_allclose(seen.size[:NUM_CARS], boxes[:, 3:6], atol=0.01)
     np.testing.assert_allclose(seen.score[:NUM_CARS], 1 / (1 + np.exp(-scores)), rtol=1e-5)
+    range_sq = np.sum(boxes[:, :2] ** 2, axis=1)
+    np.testing.assert_allclose(seen.num_points[:NUM_CARS] * range_sq, bench.POINTS_AT_1M, rtol=0.02)
     assert not seen.center[NUM_CARS:].any()
     assert (seen.label == Label.CAR).all()
     assert not bench.padded([], calibration).valid.any()

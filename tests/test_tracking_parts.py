@@ -171,17 +171,52 @@ def test_votes_find_the_front_and_say_how_sure_they_are():
     for _ in range(4):
         slots = dataclasses.replace(slots, front_vote=shape.update_front(slots))
     np.testing.assert_allclose(slots.front_vote, [[-4, 0], [2, 0], [0, 0]], atol=1e-6)
-    heading, probability = shape.front_of(jnp.full(3, 0.1), slots.front_vote)
+    heading, probability = shape.front_of(jnp.full(3, 0.1), slots)
     np.testing.assert_allclose(heading, [0.1 - np.pi, 0.1, 0.1], atol=1e-6)
     votes = np.array([4, 2, 0]) * np.cos(0.1)
     np.testing.assert_allclose(probability, 1 / (1 + np.exp(-votes)), rtol=1e-6)
+
+
+def profile_log_odds(log_odds, yaw=0.0):
+    """Log odds of the front at a yaw, after detections at yaw 0 with these log odds of theirs."""
+    seen = traffic.observations(np.zeros((len(log_odds), 3)), front_log_odds=log_odds)
+    vote = np.asarray(shape.profile_votes(seen)).sum(axis=0, keepdims=True)
+    slots = slots_of(profile_vote=vote, hits=np.int32([len(log_odds)]))
+    return float(shape.profile_log_odds(np.float32([[np.cos(yaw), np.sin(yaw)]]), slots)[0])
+
+
+def test_profiles_of_several_sweeps_count_as_normal_variables_with_one_correlation():
+    rng = np.random.default_rng(0)
+    for num in (1, 2, 7):
+        # Log odds of the front: of 2 m C^-1 x with the mean m and the covariance C, here of unit variance.
+        covariance = np.full((num, num), shape.PROFILE_CORRELATION)
+        np.fill_diagonal(covariance, 1.0)
+        values, mean = rng.normal(0.3, 1, num), np.full(num, 0.3)
+        expected = 2 * mean @ np.linalg.inv(covariance) @ values
+        assert profile_log_odds(2 * 0.3 * values) == pytest.approx(expected, rel=1e-5)
+
+
+def test_many_sweeps_of_a_weak_profile_are_no_certainty():
+    weak = np.log(0.6 / 0.4)
+    assert profile_log_odds([weak]) == pytest.approx(weak, rel=1e-6)
+    assert profile_log_odds([weak] * 50) < profile_log_odds([weak] * 500) < weak / shape.PROFILE_CORRELATION
+    assert 1 / (1 + np.exp(-profile_log_odds([weak] * 50))) < 0.92
+    for sign in (-1, 1):
+        assert profile_log_odds([sign * 9.0] * 50) == pytest.approx(sign * shape.MAX_PROFILE_LOG_ODDS)
+
+
+def test_a_profile_says_nothing_of_the_front_across_it_and_the_opposite_behind():
+    log_odds = [1.0, 2.0, -0.5]
+    assert profile_log_odds(log_odds, np.pi / 2) == pytest.approx(0, abs=1e-6)
+    assert profile_log_odds(log_odds, np.pi) == pytest.approx(-profile_log_odds(log_odds), rel=1e-5)
 
 
 def test_headings_are_in_their_interval():
     yaw = np.linspace(-np.pi / 2, np.pi / 2, 1001, endpoint=False, dtype=np.float32)
     yaw = np.concatenate([yaw, np.nextafter(np.float32(0), np.float32([-1, 1])), np.float32([0])])
     for sign in (-1, 1):
-        heading, _ = shape.front_of(yaw, sign * np.stack([np.cos(yaw), np.sin(yaw)], axis=1))
+        vote = sign * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+        heading, _ = shape.front_of(yaw, slots_of(len(yaw), front_vote=vote))
         assert (np.abs(np.sin(np.asarray(heading, float) - yaw)) < 1e-6).all()
         assert (heading >= np.float32(-np.pi)).all()
         assert (heading < np.float32(np.pi)).all()

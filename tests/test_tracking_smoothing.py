@@ -8,7 +8,16 @@ import pytest
 import traffic
 
 from jaxbox.config import TrackConfig
-from jaxbox.tracking import Motion, Sight, TrackerState, offline_motion, paths, smooth, track_sequence
+from jaxbox.tracking import (
+    Motion,
+    Sight,
+    TrackerState,
+    offline_motion,
+    paths,
+    smooth,
+    smoothing,
+    track_sequence,
+)
 
 CONFIG = TrackConfig()
 NUM_SWEEPS = 60
@@ -170,6 +179,66 @@ def test_a_standing_car_has_no_front_and_one_yaw_for_all_sweeps():
     assert abs(smoothed[0].yaw[0]) < 0.05
     assert {int(of_sweep.motion[0]) for of_sweep in smoothed} == {Motion.STANDING}
     assert smoothed[0].front_probability == pytest.approx(0.5)
+
+
+def test_the_front_is_by_motion_and_where_a_car_stands_by_its_profile():
+    for speed, sign in ((0.0, -1), (0.0, 1), (10.0, 1)):
+        recording = one_car(speed=speed)
+        recording.seen.front_log_odds[:] = sign * (1.0 if speed == 0 else -9.0)
+        for of_sweep in smooth(*tracked(recording)):
+            np.testing.assert_allclose(np.cos(of_sweep.heading), sign, atol=1e-3)
+            assert of_sweep.front_probability > 0.99
+
+
+def test_height_and_vertical_place_are_those_of_the_track_also_in_gaps():
+    recording = one_car(speed=2.0, missing=(20, 21))
+    rng = np.random.default_rng(1)
+    recording.seen.size[..., 2] += rng.normal(0, 0.2, recording.seen.size.shape[:2])
+    noise = rng.normal(0, 0.1, recording.seen.size.shape[:2])
+    # It drives uphill.
+    hill = 0.05 * np.arange(len(recording))[:, None]
+    recording.seen.center[..., 2] += hill + noise
+    tracks, seen, poses, times = tracked(recording)
+    smoothed = smooth(tracks, seen, poses, times)
+    heights = {float(of_sweep.size[0, 2]) for of_sweep in smoothed}
+    assert len(heights) == 1
+    assert heights.pop() == pytest.approx(1.5, abs=0.1)
+    # Away from both ends.
+    errors = [float(smoothed[f].center[0, 2]) - hill[f, 0] for f in range(5, len(recording) - 5)]
+    assert np.std(errors) < 0.6 * noise.std()
+    assert abs(np.mean(errors)) < 0.02
+    np.testing.assert_array_equal(smoothed[20].center[0, 2], smoothed[20].filtered_center[0, 2])
+
+
+def test_what_moves_has_the_box_of_its_track_and_what_stands_that_of_the_sweep():
+    for speed, is_own in ((10.0, False), (0.0, True)):
+        recording = one_car(speed=speed)
+        rng = np.random.default_rng(2)
+        shape = recording.seen.size.shape[:2]
+        error = rng.normal(0, 0.1, (*shape, 2))
+        recording.seen.center[..., :2] += error
+        recording.seen.size[..., 0] += rng.normal(0, 0.2, shape)
+        smoothed = smooth(*tracked(recording))[5:-5]
+        truth = recording.seen.center[5:-5, 0, :2] - error[5:-5, 0]
+        center = np.array([of_sweep.center[0, :2] for of_sweep in smoothed])
+        filtered = np.array([of_sweep.filtered_center[0, :2] for of_sweep in smoothed])
+        lengths = {round(float(of_sweep.size[0, 0]), 4) for of_sweep in smoothed}
+        assert (len(lengths) > 1) == is_own
+        assert np.array_equal(center, filtered) == (not is_own)
+        if not is_own:
+            assert np.std(center - truth) < 0.06
+
+
+def test_a_track_of_few_detections_is_believed_less():
+    scores = []
+    for num in (2, 10, 50):
+        tracks, seen, poses, times = tracked(one_car(missing=range(num, 50)))
+        scores.append(float(smooth(tracks, seen, poses, times)[0].score[0]))
+    # Each detection has .8, and so has the track that is in all sweeps.
+    assert scores[-1] == pytest.approx(0.8)
+    few = smoothing.BELIEVED_HITS
+    expected = [0.8 * num / (num + few) * (50 + few) / 50 for num in (2, 10, 50)]
+    np.testing.assert_allclose(scores, expected, rtol=1e-5)
 
 
 def test_an_unseen_length_is_the_tracks_and_the_visible_faces_stay():

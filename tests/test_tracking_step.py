@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import io
+import types
 
 import chex
 import jax
@@ -653,6 +654,52 @@ def test_a_track_that_is_missed_lives_as_long_as_it_is_told_or_was_seen(hidden, 
         assert int(tracks.counts.tracks) == 3
     _, tracks = step(state, cars([], first_return_m=first_return_m), 0.1, STAY)
     assert (int(tracks.counts.tracks), int(tracks.counts.deaths)) == (0, 3)
+
+
+def test_the_front_of_a_standing_car_is_that_of_its_profile_wherever_it_is_seen_from():
+    state = start()
+    for index in range(12):
+        # The sensor drives in a circle; the car points along +y of the world. Its yaw is that of the axis.
+        T_world_sensor = traffic.pose(0.5 * index, 0.0, 0.3 * index)
+        T_world_before = traffic.pose(0.5 * (index - 1), 0.0, 0.3 * (index - 1)) if index else np.eye(4)
+        place = (np.linalg.inv(T_world_sensor) @ [10, 5, 0, 1])[:3]
+        heading = np.pi / 2 - 0.3 * index
+        yaw = (heading + np.pi / 2) % np.pi - np.pi / 2
+        seen = traffic.observations([place], yaw=[yaw], front_log_odds=[1.5 * np.sign(np.cos(heading - yaw))])
+        moved = np.linalg.inv(T_world_before) @ T_world_sensor
+        state, tracks = step(state, seen, 0.1, moved.astype(np.float32))
+        assert int(tracks.id[0]) == 0
+        assert turned_difference(float(tracks.heading[0]), heading, 2 * np.pi) < 0.05
+        assert float(tracks.front_probability[0]) > 0.8
+    assert float(tracks.front_probability[0]) < 1 / (1 + np.exp(-1.5 / 0.15))
+
+
+def test_motion_outvotes_a_profile():
+    state, headings = start(), []
+    for index in range(40):
+        place = [-20.0 + 0.8 * index, 8.0, 0.0]
+        seen = traffic.observations([place], front_log_odds=[-8.0])
+        state, tracks = step(state, seen, 0.1, STAY)
+        headings.append(float(tracks.heading[0]))
+    assert abs(headings[0]) == pytest.approx(np.pi, abs=1e-5)
+    assert headings[-1] == pytest.approx(0, abs=0.01)
+    assert float(tracks.front_probability[0]) > 0.99
+
+
+@pytest.mark.parametrize(
+    ("probability", "turned", "expected"),
+    [(0.5, False, 0.0), (0.9, False, np.log(9)), (0.9, True, -np.log(9)), (1.0, False, np.log(1e6))],
+)
+def test_log_odds_of_a_detections_front_are_those_of_its_yaw(probability, turned, expected):
+    yaw = np.linspace(-1.5, 1.5, 5, dtype=np.float32)
+    found = types.SimpleNamespace(
+        yaw=yaw,
+        heading=yaw + np.float32(np.pi * turned),
+        front_probability=np.full(5, probability, np.float32),
+        hulls=types.SimpleNamespace(vertices=np.zeros((5, 3, 2), np.float32)),
+        **dict.fromkeys(("center", "size", "score", "label", "num_points", "valid", "first_return_m")),
+    )
+    np.testing.assert_allclose(observe(found).front_log_odds, expected, rtol=0.02, atol=1e-6)
 
 
 def test_a_car_that_drives_is_known_by_its_velocity_and_front():

@@ -63,6 +63,7 @@ def observations(center, **fields: Any) -> Observations:
         "label": filled(0, dtype=np.int32),
         "num_points": filled(200, dtype=np.int32),
         "extent": filled([4.0, 1.6], 2),
+        "front_log_odds": filled(0),
         "valid": filled(True, dtype=bool),
         "first_return_m": np.full((*shape[:-1], NUM_AZIMUTHS), FAR_M, np.float32),
     }
@@ -157,6 +158,8 @@ def _look(rng, T_sensor_world, cars, sizes, wall, capacity):
         score=rng.uniform(0, 0.2, capacity),
         valid=np.zeros(capacity, bool),
         extent=rng.uniform(1, 5, (capacity, 2)),
+        # Of a generator of its own.
+        front_log_odds=rng.spawn(1)[0].normal(0.5, 1, capacity),
         first_return_m=np.where(is_wall, 10.0, FAR_M),
     )
     of_cars = slice(0, found.sum())

@@ -157,6 +157,7 @@ def to_current_frame(track: Track, interval: Interval) -> None:
     track.covariance = both @ track.covariance @ both.T
     track.yaw_vote *= np.exp(2j * turn)
     track.front_vote *= np.exp(1j * turn)
+    track.profile_vote *= np.exp(1j * turn)
     for moment in track.path:
         away = np.array([*moment.position, 0.0]) - interval.translation
         moment.position = (turned @ away)[:2]
@@ -179,6 +180,7 @@ def predict(track: Track, dt: float, config: TrackConfig) -> None:
     track.covariance = step @ track.covariance @ step.T + noise
     track.yaw_vote *= np.exp(2j * track.turn_rate * dt)
     track.front_vote *= np.exp(1j * track.turn_rate * dt)
+    track.profile_vote *= np.exp(1j * track.turn_rate * dt)
     track.age += 1
 
 
@@ -203,8 +205,8 @@ def _in_order_of_score(seen: Any) -> list[int]:
 
 
 def _is_finite(seen: Any, row: int) -> bool:
-    numbers = (seen.center[row], seen.size[row], seen.extent[row], seen.yaw[row], seen.score[row])
-    return all(bool(np.isfinite(np.asarray(number)).all()) for number in numbers)
+    names = ("center", "size", "extent", "yaw", "score", "front_log_odds")
+    return all(bool(np.isfinite(np.asarray(getattr(seen, name)[row])).all()) for name in names)
 
 
 def associate(tracker: Tracker, seen: Any, rows: list[int], config: TrackConfig) -> dict[int, int]:
@@ -255,6 +257,7 @@ def learn(track: Track, seen: Any, row: int, dt: float, config: TrackConfig) -> 
     z_gain = Z_GAIN if track.hits > MATURE_HITS else FIRST_Z_GAIN
     track.position[2] += z_gain * (center[2] - track.position[2])
     vehicle_shape.vote_front(track)
+    track.profile_vote += vehicle_shape.profile_vote(seen, row)
     track.score_sum += score
     track.label_scores[int(seen.label[row])] += score
     track.hits += 1
@@ -381,6 +384,7 @@ def first_seen(seen: Any, row: int, number: int, config: TrackConfig) -> Track:
         velocity=np.zeros(2),
         covariance=np.diag(variances),
         yaw_vote=vehicle_shape.yaw_vote(seen, row),
+        profile_vote=vehicle_shape.profile_vote(seen, row),
         size_sums=vehicle_shape.size_sums(seen, row, crossed=False),
         extent=np.asarray(seen.extent[row], float),
         score_sum=score,
@@ -428,7 +432,7 @@ def describe(
     if row is not None:
         shown = vehicle_shape.refine_box(track, seen, row)
         score = math.sqrt(score * float(seen.score[row]))
-    heading, front_probability = vehicle_shape.front_of(shown.yaw, track.front_vote)
+    heading, front_probability = vehicle_shape.front_of(shown.yaw, track)
     motion, shift = vehicle_motion.classify(track, tracker, config)
     missed = "HIDDEN" if track.hidden_now else "COASTING"
     return TrackedVehicle(

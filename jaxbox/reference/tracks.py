@@ -68,6 +68,7 @@ class Track:
     turn_rate: float = 0.0
     """rad/s."""
     front_vote: complex = 0j
+    profile_vote: complex = 0j
     """Weighted sum of the directions x + i y in which it moved."""
     hits: int = 1
     """Sweeps in which it was detected."""

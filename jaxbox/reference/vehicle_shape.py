@@ -21,6 +21,8 @@ MAX_COURSE_SD = 0.15
 """The course is believed where the velocity's standard deviation is below this share of the speed."""
 FULL_FRONT_SPEED_MPS = 3.0
 """Speed from which a sweep's motion counts as one whole vote for the front."""
+PROFILE_CORRELATION, MAX_PROFILE_LOG_ODDS = 0.15, 6.0
+"""Correlation of the log odds that two sweeps see of a front, and the most that all sweeps are worth."""
 MAX_TURN_RATE = math.pi / 2
 """No vehicle turns faster, rad/s."""
 
@@ -221,17 +223,33 @@ def vote_front(track: Track) -> None:
         track.front_vote += weight * complex(*track.velocity) / track.speed
 
 
-def front_of(yaw: float, front_vote: complex) -> tuple[float, float]:
+def profile_vote(seen: Any, row: int) -> complex:
+    """What a detection votes for as the front, by its profile.
+
+    Args:
+      seen: D detections.
+      row: of the detection.
+
+    Returns:
+      exp(i yaw), times its log odds that the front is there.
+    """
+    return float(seen.front_log_odds[row]) * np.exp(1j * float(seen.yaw[row]))
+
+
+def front_of(yaw: float, track: Track) -> tuple[float, float]:
     """Where the front of a box points, and how sure that is.
 
     Args:
       yaw: rad, of the length axis.
-      front_vote: in whole votes.
+      track: with its votes.
 
     Returns:
       Heading (rad, in [-pi, pi)) and probability.
     """
-    votes = (front_vote * np.exp(-1j * yaw)).real
+    back = np.exp(-1j * yaw)
+    # The log likelihood ratio of normal variables with one correlation between any two.
+    profile = (track.profile_vote * back).real / (1 + (track.hits - 1) * PROFILE_CORRELATION)
+    votes = (track.front_vote * back).real + np.clip(profile, -MAX_PROFILE_LOG_ODDS, MAX_PROFILE_LOG_ODDS)
     heading = yaw if votes >= 0 else yaw + math.pi
     return (heading + math.pi) % (2 * math.pi) - math.pi, 1 / (1 + math.exp(-abs(votes)))
 

@@ -116,5 +116,6 @@ def to_current_frame(slots: Slots, interval: Interval) -> Slots:
         velocity=rotate(slots.velocity, turn),
         yaw_vote=rotate(slots.yaw_vote, 2 * turn),
         front_vote=rotate(slots.front_vote, turn),
+        profile_vote=rotate(slots.profile_vote, turn),
         path=jnp.concatenate([place, rotate(slots.path[..., 2:], turn)], axis=-1),
     )

@@ -46,6 +46,8 @@ class Paths:
     """(I, L), likewise."""
     extent: np.ndarray
     """(I, L, 2) m: what was seen, along and across, likewise."""
+    front_log_odds: np.ndarray
+    """(I, L): that the front is where its yaw points, likewise."""
     sensor: np.ndarray
     """(I, L, 2) m, world: where the sensor was."""
 
@@ -112,20 +114,19 @@ class Sightings(NamedTuple):
     hit: np.ndarray
     """(n,) bool: whether it was detected."""
     numbers: np.ndarray
-    """(n, 11): centre (m), size (m), yaw (rad), score, points, extents (m); 0 where it was not."""
+    """(n, 12): centre (m), size (m), yaw (rad), score, points, extents (m), log odds of the front; 0 where
+    it was not."""
 
 
 def _sightings(tracks: Tracks, seen: Observations, T_world_sensor: np.ndarray) -> Sightings:
     slot = np.flatnonzero(tracks.valid)
     row = np.asarray(tracks.detection)[slot]
     hit = row > FREE
-    center, size, yaw, score, num_points, extent = (
-        np.asarray(a, float)[row]
-        for a in (seen.center, seen.size, seen.yaw, seen.score, seen.num_points, seen.extent)
-    )
+    names = ("center", "size", "yaw", "score", "num_points", "extent", "front_log_odds")
+    center, size, yaw, *others = (np.asarray(getattr(seen, name), float)[row] for name in names)
     center = center @ T_world_sensor[:3, :3].T + T_world_sensor[:3, 3]
     yaw = yaw + np.arctan2(T_world_sensor[1, 0], T_world_sensor[0, 0])
-    numbers = np.column_stack([center, size, yaw, score, num_points, extent])
+    numbers = np.column_stack([center, size, yaw, *others])
     return Sightings(np.asarray(tracks.id)[slot], slot, hit, np.where(hit[:, None], numbers, 0.0))
 
 
@@ -153,7 +154,7 @@ def _pad(
     length = last - first + 1
     shape = len(ids), int(length.max())
     sweep = first[:, None] + np.minimum(np.arange(shape[1]), length[:, None] - 1)
-    slot, hit, numbers = np.full(shape, FREE), np.zeros(shape, bool), np.zeros((*shape, 11))
+    slot, hit, numbers = np.full(shape, FREE), np.zeros(shape, bool), np.zeros((*shape, 12))
     slot[at], hit[at], numbers[at] = rows.slot, rows.hit, rows.numbers
     return Paths(
         id=ids,
@@ -168,6 +169,7 @@ def _pad(
         score=numbers[..., 7],
         num_points=numbers[..., 8],
         extent=numbers[..., 9:11],
+        front_log_odds=numbers[..., 11],
         sensor=T_world_sensor[sweep][..., :2, 3],
     )
 

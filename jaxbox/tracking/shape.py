@@ -35,6 +35,11 @@ MAX_COURSE_SD = 0.15
 """The course is believed where the velocity's standard deviation is below this share of the speed."""
 FULL_FRONT_SPEED_MPS = 3.0
 """Speed from which a sweep's motion counts as one whole vote for the front."""
+PROFILE_CORRELATION = 0.15
+"""Correlation of the log odds that two sweeps see of one vehicle's front. Chosen on two real and six ray-cast
+drives, each left out in turn: .05 to .15 predict fronts equally well, and the largest is the least sure."""
+MAX_PROFILE_LOG_ODDS = 6.0
+"""However many sweeps agree on a profile, it is outvoted by this many whole votes of motion."""
 MAX_TURN_RATE = math.pi / 2
 """No vehicle turns faster, rad/s; a rate beyond it is of two sweeps with nearly the same time."""
 
@@ -101,6 +106,30 @@ def update_front(slots: Slots) -> jax.Array:
     direction = slots.velocity / jnp.maximum(speed, 1e-6)
     weight = jnp.minimum(speed / FULL_FRONT_SPEED_MPS, 1.0)
     return slots.front_vote + jnp.where(slots.moving[:, None], weight * direction, 0.0)
+
+
+def profile_votes(seen: Observations) -> jax.Array:
+    """(D, 2) float32: what each detection adds to `Slots.profile_vote`."""
+    axis = jnp.stack([jnp.cos(seen.yaw), jnp.sin(seen.yaw)], axis=-1)
+    return seen.front_log_odds[:, None] * axis
+
+
+def profile_log_odds(axis: jax.Array, slots: Slots) -> jax.Array:
+    """Log odds that the front is where a direction points, by the profiles of all n detections.
+
+    With the same correlation rho between any two of them, and normal errors, they are the sum of theirs over
+    1 + (n - 1) rho: n alike are never worth more than 1 / rho of them.
+
+    Args:
+      axis: (T, 2) float32, of length 1.
+      slots: T tracks.
+
+    Returns:
+      (T,) float32.
+    """
+    num_more = jnp.maximum(slots.hits.astype(jnp.float32) - 1, 0)
+    log_odds = jnp.sum(axis * slots.profile_vote, axis=-1) / (1 + num_more * PROFILE_CORRELATION)
+    return jnp.clip(log_odds, -MAX_PROFILE_LOG_ODDS, MAX_PROFILE_LOG_ODDS)
 
 
 def update_extent(slots: Slots, seen: Observations, is_crossed: jax.Array) -> jax.Array:
@@ -189,19 +218,20 @@ def is_crossed(seen_yaw: jax.Array, yaw: jax.Array) -> jax.Array:
     return jnp.abs(wrap_yaw(seen_yaw - yaw)) > jnp.pi / 4
 
 
-def front_of(yaw: jax.Array, front_vote: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Finds where the front of a box points, and with what probability.
+def front_of(yaw: jax.Array, slots: Slots) -> tuple[jax.Array, jax.Array]:
+    """Finds where the front of a box points, and with what probability, by motion and profile.
 
     Args:
       yaw: (T,) float32, rad, in [-pi/2, pi/2), of the length axis.
-      front_vote: (T, 2) float32, in whole votes.
+      slots: T tracks.
 
     Returns:
       heading: (T,) float32, rad, in [-pi, pi): yaw, or half a turn further.
-      probability: (T,) float32, in [.5, 1]: the logistic function of the votes along the axis.
+      probability: (T,) float32, in [.5, 1]: the logistic function of the votes of motion along the axis, a
+        whole one a unit, and the log odds of the profile.
     """
     axis = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
-    votes = jnp.sum(axis * front_vote, axis=-1)
+    votes = jnp.sum(axis * slots.front_vote, axis=-1) + profile_log_odds(axis, slots)
     heading = jnp.where(votes >= 0, yaw, yaw + jnp.pi)
     # Compared and not divided, so that no rounding leaves the interval.
     heading = jnp.where(heading >= jnp.pi, heading - 2 * jnp.pi, heading)

@@ -1,8 +1,10 @@
 """The second pass over a whole recording: what is seen later tells about what was seen before.
 
 Positions are smoothed forward and backward, a track has one size and, where it stands, one yaw, and it goes
-on through short gaps. As in the step, a detection's visible faces stay where its sweep saw them: the size of
-the track is for the sides that the sweep did not see. All is float64 in NumPy, in the world of the poses.
+on through short gaps. What moves has the box of its track. Of what stands, as in the step, visible faces stay
+where each sweep saw them: length and width of the track are for the sides that it did not see. Height and
+vertical place are the track's in every sweep, because single ones depend on which beams hit the roof. All is
+float64 in NumPy, in the world of the poses.
 
 Axis letters: I tracks, L moments, F sweeps.
 """
@@ -19,8 +21,10 @@ from jaxbox.tracking.shape import (
     CROSSED_WEIGHT,
     FULL_FRONT_SPEED_MPS,
     MAX_GROWTH,
+    MAX_PROFILE_LOG_ODDS,
     MAX_SIZE_POINTS,
     MAX_YAW_POINTS,
+    PROFILE_CORRELATION,
     SEEN_QUANTILE,
     SEEN_SHARE,
 )
@@ -34,12 +38,17 @@ MIN_EXTENTS = 5
 """From this many extents on, a track is at least as long as a quantile of them."""
 YAW_MEMORY_S = 0.4
 """A moving vehicle's yaw is a vote in which a detection counts exp(-t / this) at a time t from it."""
+HEIGHT_MEMORY_S = 0.2
+"""The same of the height of a box's centre; it is short, because the pitch of poses is not exact."""
 COURSE_SHARE = 0.5
 """At speeds at which the course has a vote for the yaw, it is this share of all the others."""
 MOVING_DISTANCE_M = 1.5
 """A track moves where its path is longer than this, m, and its median speed is that of a moving one."""
 TRACK_SHARE = 0.75
 """Share of the track's mean score in the logarithm of a detection's; the rest is its own."""
+BELIEVED_HITS = 4.0
+"""A track of n detections is believed n / (n + this), and one of all sweeps wholly: false alarms last shorter
+than vehicles."""
 
 
 def smooth(
@@ -157,7 +166,7 @@ def _vote_yaw(paths: Paths, velocity: np.ndarray, config: TrackConfig) -> np.nda
     weight = np.where(paths.hit, weight, 0.0)
     vote = weight * np.exp(2j * paths.yaw)
     speed = np.linalg.norm(velocity, axis=-1)
-    near_vote, near_weight = _near_sum(vote, paths.step_s), _near_sum(weight, paths.step_s)
+    near_vote, near_weight = (_near_sum(values, paths.step_s, YAW_MEMORY_S) for values in (vote, weight))
     course = np.exp(2j * np.arctan2(velocity[..., 1], velocity[..., 0]))
     near_vote += np.where(speed > config.course_speed_mps, COURSE_SHARE * near_weight, 0.0) * course
     all_votes = np.broadcast_to(vote.sum(axis=1)[:, None], vote.shape)
@@ -172,9 +181,9 @@ def _is_moving(paths: Paths, speed: np.ndarray, config: TrackConfig) -> np.ndarr
     return (median > config.moving_speed_mps) & (np.linalg.norm(way, axis=1) > MOVING_DISTANCE_M)
 
 
-def _near_sum(values: np.ndarray, step_s: np.ndarray) -> np.ndarray:
+def _near_sum(values: np.ndarray, step_s: np.ndarray, memory_s: float) -> np.ndarray:
     """(I, L): sums in which a value counts exp(-t / memory) at a time t from it, in both directions."""
-    keep = np.exp(-step_s / YAW_MEMORY_S)
+    keep = np.exp(-step_s / memory_s)
     before, after = values.copy(), values.copy()
     for k in range(1, values.shape[1]):
         before[:, k] += keep[:, k] * before[:, k - 1]
@@ -182,34 +191,37 @@ def _near_sum(values: np.ndarray, step_s: np.ndarray) -> np.ndarray:
     return before + after - values
 
 
-def _between(paths: Paths) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """The detections before and after each moment.
+def _smooth_height(paths: Paths) -> np.ndarray:
+    """(I, L) m, world: height of the centre, the mean of the detections that are near in time."""
+    total = _near_sum(np.where(paths.hit, paths.center[..., 2], 0.0), paths.step_s, HEIGHT_MEMORY_S)
+    weight = _near_sum(paths.hit.astype(float), paths.step_s, HEIGHT_MEMORY_S)
+    # In the middle of gaps of minutes, which are not shown, it is rounded to 0.
+    return total / np.maximum(weight, np.finfo(float).tiny)
 
-    Returns:
-      before, after: (I, L) int, moments of those, the same at a detection.
-      share: (I, L), of the time between them that has passed.
-      gap_s: (I, L) s, that time.
-    """
+
+def _gaps(paths: Paths) -> np.ndarray:
+    """(I, L) s: time between the detections before and after each moment; 0 at a detection."""
     moment = np.arange(paths.hit.shape[1])
     before = np.maximum.accumulate(np.where(paths.hit, moment, 0), axis=1)
     far = np.where(paths.hit, moment, len(moment) - 1)
     after = np.minimum.accumulate(far[:, ::-1], axis=1)[:, ::-1]
     time = np.cumsum(paths.step_s, axis=1)
     start, stop = (np.take_along_axis(time, index, axis=1) for index in (before, after))
-    return before, after, (time - start) / np.maximum(stop - start, 1e-9), stop - start
+    return stop - start
 
 
 def _fronts(
-    yaw: np.ndarray, velocity: np.ndarray, moving: np.ndarray, first_turn: np.ndarray
+    paths: Paths, yaw: np.ndarray, velocity: np.ndarray, moving: np.ndarray, first_turn: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where the fronts point, without jumps, and how sure that is, by the motion of the whole track.
+    """Where the fronts point, without jumps, and how sure that is, by motion and profile of the whole track.
 
     Args:
+      paths: I tracks.
       yaw: (I, L) rad, world.
       velocity: (I, L, 2) m/s.
       moving: (I, L) bool.
-      first_turn: (I,) rad, of the sensor in the first sweep: the front of what never moved is taken to point
-        away from that sensor's back.
+      first_turn: (I,) rad, of the sensor in the first sweep: the front of what neither moved nor has a
+        profile is taken to point away from that sensor's back.
 
     Returns:
       heading (I, L) rad, and probability (I,).
@@ -219,8 +231,16 @@ def _fronts(
     heading = heading + (start - heading[:, 0])[:, None]
     along = velocity[..., 0] * np.cos(heading) + velocity[..., 1] * np.sin(heading)
     votes = np.sum(np.clip(along / FULL_FRONT_SPEED_MPS, -1, 1) * moving, axis=1)
+    votes = votes + _profile_log_odds(paths, heading)
     heading = heading + np.where(votes < 0, np.pi, 0.0)[:, None]
     return heading, 1 / (1 + np.exp(-np.abs(votes)))
+
+
+def _profile_log_odds(paths: Paths, heading: np.ndarray) -> np.ndarray:
+    """(I,): of the front at these headings (I, L), as `shape.profile_log_odds` of all detections."""
+    total = np.sum(paths.front_log_odds * np.cos(paths.yaw - heading), axis=1)
+    log_odds = total / (1 + (paths.hit.sum(axis=1) - 1) * PROFILE_CORRELATION)
+    return np.clip(log_odds, -MAX_PROFILE_LOG_ODDS, MAX_PROFILE_LOG_ODDS)
 
 
 def _smooth_group(
@@ -231,30 +251,28 @@ def _smooth_group(
     # A first pass over the centres tells speed and course, which the yaw depends on.
     _, velocity, _ = smooth_positions(paths.center[..., :2], variance, paths.step_s, config)
     yaw, size, flat, shown = _find_shapes(paths, velocity, config)
-    whole = np.broadcast_to(size[:, None, :2], shown.shape)
+    sides = np.broadcast_to(size[:, None, :2], shown.shape)
     place = paths.center[..., :2]
-    anchor = _keep_visible_faces(place, flat, yaw, whole, paths.sensor)
+    anchor = _keep_visible_faces(place, flat, yaw, sides, paths.sensor)
     position, velocity, covariance = smooth_positions(anchor, variance, paths.step_s, config)
     own = _keep_visible_faces(place, flat, yaw, shown, paths.sensor)
-    before, after, share, gap_s = _between(paths)
-
-    def interpolated(values: np.ndarray) -> np.ndarray:
-        start, stop = (np.take_along_axis(values, index, axis=1) for index in (before, after))
-        return start + share * (stop - start)
-
     motion, shift = classify_paths(position, velocity, covariance, paths, config)
     first = T_world_sensor[paths.first]
     first_turn = np.arctan2(first[:, 1, 0], first[:, 0, 0])
     moving = paths.valid & (motion != Motion.STANDING)
-    heading, front_probability = _fronts(yaw, velocity, moving, first_turn)
+    heading, front_probability = _fronts(paths, yaw, velocity, moving, first_turn)
     hits = paths.hit.sum(axis=1)
     mean_score = paths.score.sum(axis=1) / hits
+    belief = hits / (hits + BELIEVED_HITS) * (1 + BELIEVED_HITS / len(tracks))
     own_score = mean_score[:, None] ** TRACK_SHARE * paths.score ** (1 - TRACK_SHARE)
-    z, height = interpolated(paths.center[..., 2]), interpolated(paths.size[..., 2])
-    hit = paths.hit[..., None]
+    z = _smooth_height(paths)[..., None]
+    whole = np.broadcast_to(size[:, None], (*yaw.shape, 3))
+    shown = np.concatenate([shown, whole[..., 2:]], axis=-1)
+    # Poses drift by more than the place of what stands is known; what moves is seen from changing sides.
+    is_own = (paths.hit & ~moving)[..., None]
     columns = {
-        "center": np.concatenate([np.where(hit, own, position), z[..., None]], axis=-1),
-        "size": np.concatenate([np.where(hit, shown, whole), height[..., None]], axis=-1),
+        "center": np.concatenate([np.where(is_own, own, position), z], axis=-1),
+        "size": np.where(is_own, shown, whole),
         "yaw": yaw,
         "heading": heading,
         "front_probability": np.broadcast_to(front_probability[:, None], yaw.shape),
@@ -263,11 +281,11 @@ def _smooth_group(
         "covariance": covariance,
         "motion": motion,
         "lateral_shift_m": shift,
-        "score": np.where(paths.hit, own_score, mean_score[:, None]),
-        "filtered_center": np.concatenate([position, z[..., None]], axis=-1),
-        "filtered_size": np.concatenate([whole, height[..., None]], axis=-1),
+        "score": belief[:, None] * np.where(paths.hit, own_score, mean_score[:, None]),
+        "filtered_center": np.concatenate([position, z], axis=-1),
+        "filtered_size": whole,
     }
-    return _rows(paths, columns, paths.valid & (paths.hit | (gap_s <= MAX_GAP_S)), tracks, T_world_sensor)
+    return _rows(paths, columns, paths.valid & (_gaps(paths) <= MAX_GAP_S), tracks, T_world_sensor)
 
 
 def _turn_rate(heading: np.ndarray, paths: Paths) -> np.ndarray:

@@ -19,6 +19,8 @@ MOMENT_S = 0.1
 """Time between the moments of a path, s,"""
 NUM_MOMENTS = 51
 """and how many are remembered: 5 s, over which a change of lanes is seen."""
+MAX_FRONT_PROBABILITY = 1 - 1e-6
+"""A detection's front is never surer than this."""
 
 
 @jax.tree_util.register_dataclass
@@ -40,6 +42,9 @@ class Observations:
     """(D,) int32: points of the box; the more, the more its yaw and size count."""
     extent: jax.Array
     """(D, 2) float32, m: what was seen of it, along and across; 0 where that is unknown."""
+    front_log_odds: jax.Array
+    """(D,) float32: log odds that the front is where the yaw points, and not opposite; 0 where that is
+    unknown."""
     valid: jax.Array
     """(D,) bool."""
     first_return_m: jax.Array
@@ -67,6 +72,8 @@ class Slots:
     """(T,) float32, rad/s."""
     front_vote: jax.Array
     """(T, 2) float32: weighted sum of the directions in which it moved."""
+    profile_vote: jax.Array
+    """(T, 2) float32: sum of the directions in which its detections saw a front, each times its log odds."""
     size_sum: jax.Array
     """(T, 4) float32: weighted sums of length, width and height (m), and of the weights."""
     extent: jax.Array
@@ -169,6 +176,7 @@ def empty_slots(num_slots: int) -> Slots:
         yaw_vote=zeros(2),
         turn_rate=zeros(),
         front_vote=zeros(2),
+        profile_vote=zeros(2),
         size_sum=zeros(4),
         extent=zeros(2),
         score_sum=zeros(),
@@ -192,7 +200,8 @@ def observe(detections: Detections) -> Observations:
       detections: K of them, of `jaxbox.detect`.
 
     Returns:
-      The observations, whose seen extents are those of the hulls along and across each box.
+      The observations, whose seen extents are those of the hulls along and across each box, and whose log
+      odds of the front are those of its profile.
     """
     yaw = detections.yaw
     along = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=-1)
@@ -200,6 +209,10 @@ def observe(detections: Detections) -> Observations:
     axes = jnp.stack([along, across], axis=-1)
     places = detections.hulls.vertices @ axes
     extent = jnp.max(places, axis=-2) - jnp.min(places, axis=-2)
+    ahead = jnp.cos(detections.heading - yaw) >= 0
+    # Probabilities are rounded to 1 long before their log odds end.
+    front = jnp.minimum(detections.front_probability, MAX_FRONT_PROBABILITY)
+    log_odds = jnp.log(front) - jnp.log1p(-front)
     return Observations(
         center=detections.center,
         size=detections.size,
@@ -208,6 +221,7 @@ def observe(detections: Detections) -> Observations:
         label=detections.label,
         num_points=detections.num_points,
         extent=extent,
+        front_log_odds=jnp.where(ahead, log_odds, -log_odds),
         valid=detections.valid,
         first_return_m=detections.first_return_m,
     )

@@ -108,7 +108,8 @@ def _take(seen: Observations, order: jax.Array) -> Observations:
 
 
 def _is_finite(seen: Observations) -> jax.Array:
-    numbers = [seen.center, seen.size, seen.extent, seen.yaw[:, None], seen.score[:, None]]
+    rows = jnp.stack([seen.yaw, seen.score, seen.front_log_odds], axis=1)
+    numbers = [seen.center, seen.size, seen.extent, rows]
     return jnp.all(jnp.isfinite(jnp.concatenate(numbers, axis=1)), axis=1)
 
 
@@ -134,6 +135,7 @@ def predict(slots: Slots, dt: jax.Array, config: TrackConfig) -> Slots:
         covariance=kalman.predict_covariance(slots.covariance, dt, config.acceleration_mps2),
         yaw_vote=rotate(slots.yaw_vote, 2 * turn),
         front_vote=rotate(slots.front_vote, turn),
+        profile_vote=rotate(slots.profile_vote, turn),
         age=slots.age + 1,
     )
 
@@ -191,6 +193,7 @@ def _learn(slots: Slots, own: Observations, dt: jax.Array, config: TrackConfig) 
         moved,
         z=slots.z + z_gain * (own.center[:, 2] - slots.z),
         front_vote=shape.update_front(moved),
+        profile_vote=slots.profile_vote + shape.profile_votes(own),
         score_sum=slots.score_sum + own.score,
         label_score=slots.label_score + _label_score(own),
         hits=slots.hits + 1,
@@ -298,6 +301,7 @@ def _first_seen(seen: Observations, config: TrackConfig) -> Slots:
         z=seen.center[:, 2],
         covariance=jnp.stack([variance, jnp.zeros_like(variance), speed_variance], axis=1),
         yaw_vote=shape.yaw_weight(seen)[:, None] * shape.doubled(seen.yaw),
+        profile_vote=shape.profile_votes(seen),
         size_sum=shape.size_sums(seen, jnp.zeros(num, bool)),
         extent=seen.extent,
         score_sum=seen.score,
@@ -351,7 +355,7 @@ def _answer(
     own_center, own_size, own_yaw = shape.refine_boxes(slots, own)
     shown_yaw = jnp.where(is_seen, own_yaw, yaw)
     mean_score = slots.score_sum / jnp.maximum(slots.hits.astype(jnp.float32), 1)
-    heading, front_probability = shape.front_of(shown_yaw, slots.front_vote)
+    heading, front_probability = shape.front_of(shown_yaw, slots)
     motions, shift = motion.classify(slots, state.moment_age_s, config)
     missed = jnp.where(slots.hidden_now, Sight.HIDDEN.value, Sight.COASTING.value)
     bits = {

@@ -188,8 +188,8 @@ class Tracks(BoxRows[Track]):
     heading: jax.Array
     """(T,) float32, rad, in [-pi, pi): where the front points; ``yaw`` or half a turn further."""
     front_probability: jax.Array
-    """(T,) float32, in [.5, 1]: P(front), that the front is at ``heading`` and not opposite; .5 where the
-    vehicle never moved."""
+    """(T,) float32, in [.5, 1]: P(front), that the front is at ``heading`` and not opposite, by its
+    motion and by the profiles of its detections; .5 where neither says anything."""
     velocity: jax.Array
     """(T, 2) float32, m/s, over ground, along the axes of this sweep's sensor frame."""
     turn_rate: jax.Array

@@ -16,7 +16,7 @@ from jaxbox.viz.image_boxes import draw_image_boxes, scale_camera
 ARROW_S = 1.0
 """The arrow of a velocity ends where the vehicle is after this time."""
 MIN_FRONT_PROBABILITY = 0.75
-"""From this P(front) on the front is marked: the heading of what never moved is a guess."""
+"""From this P(front) on the front is marked: without motion or a clear profile it is a guess."""
 _HEAD_M = 1.2
 _MIN_SPEED_MPS = 1e-3
 _HIDDEN_PX = 1
