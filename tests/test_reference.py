@@ -533,7 +533,7 @@ def test_without_evidence_every_ray_counts_as_hit_and_the_ground_is_not_looked_a
     completed = reference.Completed([reference.ClassHypothesis(0, Label.CAR)], [box], 1)
     config = DetectorConfig.paper()
     nothing = reference.index_obstacles(np.zeros((0, 3)), np.zeros(0), np.zeros(0, int))
-    (candidate,) = reference.score_boxes(completed, None, np.array([np.inf]), [cluster], nothing, config)
+    (candidate,) = reference.score_boxes(completed, None, lambda _: np.inf, [cluster], nothing, config)
     around = reference.cluster_alone(50, 1.5)
     found = {"hit": 1.0, "free_length": 0.0, "support": None}
     expected = reference.score_box(box, CAR, around=around, num_points=50, **found, config=config.vehicles)

@@ -75,11 +75,11 @@ def score_boxes(
             config=config.vehicles,
         )
         around = _look_around(box.box, prior, cluster, early, obstacles, config.vehicles)
-        rho = float(np.hypot(box.box[0], box.box[1]))
         if config.vehicles.neighbourhood and config.completion.mode != "none":
             beam_angle = 2 * np.pi / config.evidence.num_azimuths
             seen = end_where_seen(box.box, around, float(prior.length_m), config.completion, beam_angle)
             box = dataclasses.replace(box, box=seen)
+        rho = float(np.hypot(box.box[0], box.box[1]))
         late, is_cut = neighbourhood_score(around, rho, reach(box.box), prior, config.vehicles)
         return Candidate(hypothesis, box, around, is_cut, early * late)
 

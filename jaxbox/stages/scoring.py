@@ -118,14 +118,12 @@ def _early_scores(
 
     def score(rows: tuple[Boxes, jax.Array, jax.Array, tuple[RayFractions, jax.Array] | None]) -> jax.Array:
         boxes, label, cluster, rays = rows
+        prior = prior_of(config.classes, label)
         ones = jnp.ones_like(boxes.yaw)
         hit, free_length, support = ones, 0 * ones, config.support_points * ones
         if rays is not None:
-            hit, free_length, support = rays[0].hit, rays[0].free_length, rays[1]
+            hit, free_length, support = rays[0].hit, closed_free_length(rays[0], prior), rays[1]
         num_points = take(clusters.num_points, cluster)
-        prior = prior_of(config.classes, label)
-        if rays is not None:
-            free_length = closed_free_length(rays[0], prior)
         by_evidence = evidence_score(num_points, hit, free_length, support, boxes.objective, config)
         by_size = size_score(boxes.length, boxes.width, prior)
         score = by_evidence * by_size * prior.prior_weight
