@@ -716,6 +716,15 @@ def test_the_ring_of_a_long_vehicle_reaches_farther_past_its_ends_but_not_its_si
         assert (around.num_inside, around.num_ring) == (1, num_ring)
 
 
+def test_what_overhangs_the_ends_of_a_long_vehicle_is_its_own():
+    box = np.array([0.0, 10.0, 8.0, 2.0, 0.0])
+    xyz = np.array([[0, 10, 0], [4.35, 10, 0], [-4.69, 10.5, 0], [4.75, 10, 0], [4.35, 11.15, 0]])
+    for past_ends_m, counts in ((0, (1, 2)), (0.3, (2, 3)), (2, (3, 2))):
+        prior = dataclasses.replace(LOW_CAR, past_ends_m=past_ends_m)
+        around = reference.count_points_around(box, prior, obstacles_of(xyz, np.ones(5)), AROUND)
+        assert (around.num_inside, around.num_ring) == counts, past_ends_m
+
+
 def test_what_is_behind_a_box_counts_the_less_the_surer_the_box_is():
     # The sensor sees the right side and the rear; points lie behind the left side and the front, and along
     # the right side.

@@ -29,6 +29,8 @@ NUM_LEVELS = 20
 """Levels of height by which the top is found."""
 SIDE_DEPTHS_M = -0.15, 0.35
 """Points at these depths behind the long side that the sensor sees lie along it."""
+OVERHANG_M = 0.6
+"""Points so far past the ends are of the vehicle, where those beyond speak against it."""
 LOWEST_LEVEL = 0.4
 """Where the levels begin, as a share of the highest that points of the vehicle may have."""
 SEEN_RAMP = 0.05
@@ -179,11 +181,11 @@ def count_points_around(
     reach_m = np.hypot(longer[2], longer[3]) / 2 + 2 * config.ring_m
     near = obstacles.tree.query_ball_point(box[:2], reach_m)
     xy, height = obstacles.xyz[near, :2], obstacles.height[near]
-    body = xy[(distance_outside(xy, box) < config.margin_m) & (height < prior.count_max_height_m)]
+    held = xy[(distance_outside(xy, box) < config.margin_m) & (height < prior.count_max_height_m)]
     counted = ~is_behind(xy, box, config.ring_m - (config.ring_m + config.margin_m) * sure)
     xy, height = xy[counted], height[counted]
-    outside = distance_outside(xy, box)
-    within = outside < config.margin_m
+    body = np.array([*box[:2], box[2] + 2 * min(prior.past_ends_m, OVERHANG_M), *box[3:]])
+    within = distance_outside(xy, body) < config.margin_m
     counted = height < prior.count_max_height_m
     upper = within & counted & (height > config.upper_height_m)
     top = top_of(height[within & counted], float(prior.count_max_height_m), float(config.top_quantile))
@@ -194,7 +196,7 @@ def count_points_around(
         num_ring=int((~within & (distance_outside(xy, longer) < config.ring_m) & counted).sum()),
         num_upper=int(upper.sum()),
         num_recessed=int((upper & (depth_behind_faces(xy, box) > prior.recess_m)).sum()),
-        deepest=float(np.max(depth_behind_end(body, box), initial=0.0)),
+        deepest=float(np.max(depth_behind_end(held, box), initial=0.0)),
     )
 
 

@@ -39,6 +39,11 @@ SIDE_DEPTH_M, SIDE_HALF_M = 0.1, 0.25
 the second, go on along that side: they are of what the box holds a part of."""
 
 
+OVERHANG_M = 0.6
+"""Where points past the ends speak against a vehicle (`ClassPrior.past_ends_m`), those up to here are its
+own: cargo bodies reach beyond the bumpers and wheels that a box is fitted to."""
+
+
 def count_points_around(
     boxes: jax.Array,
     prior: ClassPrior,
@@ -185,7 +190,8 @@ def _judge(
     is_along = jnp.abs(toward_v - side_v) < SIDE_HALF_M
     is_behind = (toward_v < far_v) | (toward_u < far_u) & ~is_along
     out_u, out_v = jnp.abs(u), jnp.where(valid & ~is_behind, jnp.abs(v) - half_w, jnp.inf)
-    inside, low = jnp.maximum(out_u - half_l, out_v) < config.margin_m, height < max_height
+    body_half_l = half_l + jnp.minimum(ring_half_l - half_l, OVERHANG_M)
+    inside, low = jnp.maximum(out_u - body_half_l, out_v) < config.margin_m, height < max_height
     upper = inside & low & (height > config.upper_height_m)
     recessed = upper & (toward_u < near_u) & (toward_v < near_v)
     ring = ~inside & low & (jnp.maximum(out_u - ring_half_l, out_v) < config.ring_m)
