@@ -107,17 +107,19 @@ class GroundConfig:
     """Growth of that band with range, m/m."""
     band_above_m: Scalar = 0.3
     """Points higher than the plane by more than this, at the sensor, are not ground."""
-    band_above_grade: Scalar = 0.12
+    band_above_grade: Scalar = 0.06
     """Growth of that band with range, m/m."""
     blind_radius_m: Scalar = 2.5
     """Points nearer than this are the ego vehicle, not ground."""
     envelope_margin_m: Scalar = 0.1
     """A cell minimum within this of the lower envelope is ground."""
     sheet_tolerance_m: Scalar = 0.04
-    """Smooth sheets of 5 x 5 m, such as ramps, are ground wherever they are within the band: they deviate
-    from a plane by less than this in the mean. 0 takes none."""
+    """Smooth sheets of 5 x 5 m, such as ramps, are ground, however fast they rise there: they deviate from a
+    plane by less than this in the mean. 0 takes none."""
     max_sheet_grade: Scalar = 0.25
     """Steepest rise of such a sheet relative to the plane, m/m."""
+    sheet_band_grade: Scalar = 0.2
+    """Growth with range of the band in which sheets are looked for, m/m."""
     min_support_share: Scalar = 0.05
     """Ground has, within 3 m, at least this share of the points up to 1.2 m above it at about its height
     (.1 to .2 m); what lies below is a reflection. 0 asks for none."""

@@ -300,17 +300,23 @@ def fit_ground_surface(xyz: np.ndarray, planes: np.ndarray, config: GroundConfig
     deviation = height_above_planes(xyz, planes, tolerance_m=float(config.min_height_m))
     rho = np.hypot(xyz[:, 0], xyz[:, 1])
     index = np.floor((xyz[:, :2] + half_m) / cell_m).astype(int)
-    ground = ((index >= 0) & (index < num_cells)).all(axis=1) & (rho > config.blind_radius_m)
-    ground &= deviation > -(config.band_below_m + config.band_below_grade * rho)
-    ground &= deviation < config.band_above_m + config.band_above_grade * rho
-    index, xy, deviation = index[ground], xyz[ground, :2], deviation[ground]
-    ground = deviation >= least_supported(deviation, xy, np.full(2, half_m), PLANE_LEVELS, config)
+    counted = ((index >= 0) & (index < num_cells)).all(axis=1) & (rho > config.blind_radius_m)
+    index, xy, deviation, rho = index[counted], xyz[counted, :2], deviation[counted], rho[counted]
+    above_band = deviation >= config.band_above_m + config.band_above_grade * rho
+    in_band = (deviation > -(config.band_below_m + config.band_below_grade * rho)) & ~above_band
+    # Higher returns can only be of sheets.
+    ground = above_band & (deviation < config.band_above_m + config.sheet_band_grade * rho)
+    least = least_supported(deviation[in_band], xy[in_band], np.full(2, half_m), PLANE_LEVELS, config)
+    ground[in_band] = deviation[in_band] >= least
     lowest = np.full((num_cells, num_cells), np.inf)
     np.minimum.at(lowest, tuple(index[ground].T), deviation[ground])
     step = float(config.max_grade * cell_m)
-    envelope = _lower_envelope(lowest, step=step, num_rounds=config.num_envelope_rounds)
+    middle = (np.arange(num_cells) + 0.5) * cell_m - half_m
+    band_m = config.band_above_m + config.band_above_grade * np.hypot(*np.meshgrid(middle, middle))
+    low = np.where(lowest < band_m, lowest, np.inf)
+    envelope = _lower_envelope(low, step=step, num_rounds=config.num_envelope_rounds)
     # Empty cells are inf on both sides, which is not below.
-    valid = (lowest < envelope + config.envelope_margin_m) | on_sheets(lowest, config)
+    valid = (low < envelope + config.envelope_margin_m) | on_sheets(lowest, config)
     return _fill_and_smooth(lowest, valid, sigma=float(config.smoothing_m / cell_m))
 
 

@@ -27,12 +27,9 @@ FAR_FILL_WIDTH = 4
 """How much wider the wide Gaussian is, which fills where the narrow one has no ground cell."""
 
 
-FAR_FILL_WEIGHT = 0.02
-"""Weight of the wide Gaussian where the narrow one has no ground cell."""
-
-
-FAR_FILL_PRIOR = 0.015
-"""Weight of the plane itself where the wide Gaussian has none either."""
+FAR_FILL_WEIGHT, FAR_FILL_PRIOR = 0.02, 0.015
+"""Weight of the wide Gaussian where the narrow one has no ground cell, and of the plane itself where the wide
+Gaussian has none either."""
 
 
 POOL_CELLS = 2
@@ -378,18 +375,21 @@ def fit_ground_surface(xyz: jax.Array, mask: jax.Array, planes: jax.Array, confi
     n = round(2 * half_m / cell_m)
     height = height_above_planes(xyz, planes, tolerance_m=config.min_height_m)
     rho = jnp.sqrt(xyz[:, 0] ** 2 + xyz[:, 1] ** 2)
-    near_plane = (height > -config.band_below_m - config.band_below_grade * rho) & (
-        height < config.band_above_m + config.band_above_grade * rho
-    )
+    above_band = height >= config.band_above_m + config.band_above_grade * rho
+    in_band = (height > -config.band_below_m - config.band_below_grade * rho) & ~above_band
     i, j = (jnp.floor((xyz[:, axis] + half_m) / cell_m).astype(jnp.int32) for axis in (0, 1))
     inside = (i >= 0) & (i < n) & (j >= 0) & (j < n)
-    may_be_ground = mask & near_plane & inside & (rho > config.blind_radius_m)
-    least = least_supported(height, xyz[:, :2], may_be_ground, (half_m, half_m), PLANE_LEVELS, config)
-    may_be_ground &= height >= least
+    counted = mask & inside & (rho > config.blind_radius_m)
+    least = least_supported(height, xyz[:, :2], counted & in_band, (half_m, half_m), PLANE_LEVELS, config)
+    may_be_sheet = above_band & (height < config.band_above_m + config.sheet_band_grade * rho)
+    may_be_ground = counted & ((in_band & (height >= least)) | may_be_sheet)
     cell = jnp.where(may_be_ground, i * n + j, n * n)
     lowest = jnp.full(n * n, jnp.inf, jnp.float32).at[cell].min(height, mode="drop").reshape(n, n)
-    envelope = _lower_envelope(lowest, config.max_grade * cell_m, config.num_envelope_rounds)
-    ground = jnp.isfinite(lowest) & (lowest < envelope + config.envelope_margin_m)
+    middle = jnp.arange(n, dtype=jnp.float32) * cell_m + (cell_m / 2 - half_m)
+    rho = jnp.sqrt(middle[:, None] ** 2 + middle[None] ** 2)
+    low = jnp.where(lowest < config.band_above_m + config.band_above_grade * rho, lowest, jnp.inf)
+    envelope = _lower_envelope(low, config.max_grade * cell_m, config.num_envelope_rounds)
+    ground = jnp.isfinite(low) & (low < envelope + config.envelope_margin_m)
     ground = ground | on_sheets(lowest, config)
     return _smooth(jnp.where(ground, lowest, 0), ground.astype(jnp.float32), config.smoothing_m / cell_m)
 
