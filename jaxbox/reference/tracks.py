@@ -68,8 +68,9 @@ class Track:
     turn_rate: float = 0.0
     """rad/s."""
     front_vote: complex = 0j
-    profile_vote: complex = 0j
     """Weighted sum of the directions x + i y in which it moved."""
+    profile_vote: complex = 0j
+    """Sum of the directions in which its detections saw a front, each times its log odds."""
     hits: int = 1
     """Sweeps in which it was detected."""
     age: int = 1
