@@ -102,8 +102,9 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
 def score_boxes(columns, prior):
     around = NeighbourhoodCounts(jnp.stack(columns["around"], axis=1))
     seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "objective"))
+    where = (columns[name] for name in ("rho", "reach", "seen_width"))
     early = scoring.evidence_score(*seen, SETTINGS)
-    late, _ = scoring.neighbourhood_score(around, columns["rho"], columns["reach"], prior, SETTINGS)
+    late, _ = scoring.neighbourhood_score(around, *where, prior, SETTINGS)
     return early * scoring.size_score(columns["length"], columns["width"], prior) * late * prior.prior_weight
 
 
@@ -127,6 +128,7 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
         "objective": rng.uniform(2, 3, MAX_BOXES),
         "rho": rng.uniform(2, 80, MAX_BOXES),
         "reach": rng.uniform(1, 6, MAX_BOXES),
+        "seen_width": rng.uniform(0, 2.5, MAX_BOXES),
         "around": [
             rng.integers(1, 400, MAX_BOXES),
             prior.height_m + rng.normal(0, 0.5, MAX_BOXES),
@@ -143,11 +145,11 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
     for row in range(MAX_BOXES):
         around = (float(value[row]) for value in columns["around"])
         one = {name: float(columns[name][row]) for name in ("hit", "free_length", "support")}
-        length, width = float(columns["length"][row]), float(columns["width"][row])
+        length, width, seen_width = (float(columns[name][row]) for name in ("length", "width", "seen_width"))
         box = np.array([columns["rho"][row], 0.0, length, width, 0.0])
         expected.append(
             reference.score_box(
-                reference.CompletedBox(box, float(columns["objective"][row]), length, width),
+                reference.CompletedBox(box, float(columns["objective"][row]), length, seen_width),
                 SETTINGS.classes[label[row]],
                 around=reference.NeighbourhoodCounts(*around),
                 num_points=int(columns["num_points"][row]),

@@ -716,13 +716,19 @@ def test_the_ring_of_a_long_vehicle_reaches_farther_past_its_ends_but_not_its_si
         assert (around.num_inside, around.num_ring) == (1, num_ring)
 
 
-def test_what_overhangs_the_ends_of_a_long_vehicle_is_its_own():
-    box = np.array([0.0, 10.0, 8.0, 2.0, 0.0])
-    xyz = np.array([[0, 10, 0], [4.35, 10, 0], [-4.69, 10.5, 0], [4.75, 10, 0], [4.35, 11.15, 0]])
-    for past_ends_m, counts in ((0, (1, 2)), (0.3, (2, 3)), (2, (3, 2))):
+def test_what_overhangs_the_visible_end_of_a_long_vehicle_is_its_own():
+    box = np.array([10.0, 2.0, 8.0, 2.0, 0.0])
+    xyz = np.array([[10, 2, 0], [5.65, 2, 0], [5.31, 2.5, 0], [5.25, 2, 0], [5.65, 0.85, 0], [14.35, 1.1, 0]])
+    for past_ends_m, counts in ((0, (1, 3)), (0.3, (2, 4)), (2, (3, 3))):
         prior = dataclasses.replace(LOW_CAR, past_ends_m=past_ends_m)
-        around = reference.count_points_around(box, prior, obstacles_of(xyz, np.ones(5)), AROUND)
+        around = reference.count_points_around(box, prior, obstacles_of(xyz, np.ones(6)), AROUND)
         assert (around.num_inside, around.num_ring) == counts, past_ends_m
+    # From beside it the sensor sees neither end.
+    prior = dataclasses.replace(LOW_CAR, past_ends_m=2.0)
+    aside = reference.count_points_around(
+        np.array([0.0, 2.0, 8.0, 2.0, 0.0]), prior, obstacles_of(xyz - [10, 0, 0], np.ones(6)), AROUND
+    )
+    assert aside.num_inside == 1
 
 
 def test_what_is_behind_a_box_counts_the_less_the_surer_the_box_is():

@@ -30,7 +30,8 @@ NUM_LEVELS = 20
 SIDE_DEPTHS_M = -0.15, 0.35
 """Points at these depths behind the long side that the sensor sees lie along it."""
 OVERHANG_M = 0.6
-"""Points so far past the ends are of the vehicle, where those beyond speak against it."""
+"""Points so far before the end that the sensor sees are of the vehicle, where those beyond speak against
+it."""
 LOWEST_LEVEL = 0.4
 """Where the levels begin, as a share of the highest that points of the vehicle may have."""
 SEEN_RAMP = 0.05
@@ -82,7 +83,8 @@ def score_boxes(
             seen = end_where_seen(box.box, around, float(prior.length_m), config.completion, beam_angle)
             box = dataclasses.replace(box, box=seen)
         rho = float(np.hypot(box.box[0], box.box[1]))
-        late, is_cut = neighbourhood_score(around, rho, reach(box.box), prior, config.vehicles)
+        where = rho, reach(box.box), box.measured_width_m
+        late, is_cut = neighbourhood_score(around, *where, prior, config.vehicles)
         return Candidate(hypothesis, box, around, is_cut, early * late)
 
     pairs = zip(completed.hypotheses, completed.boxes, strict=True)
@@ -184,8 +186,7 @@ def count_points_around(
     held = xy[(distance_outside(xy, box) < config.margin_m) & (height < prior.count_max_height_m)]
     counted = ~is_behind(xy, box, config.ring_m - (config.ring_m + config.margin_m) * sure)
     xy, height = xy[counted], height[counted]
-    body = np.array([*box[:2], box[2] + 2 * min(prior.past_ends_m, OVERHANG_M), *box[3:]])
-    within = distance_outside(xy, body) < config.margin_m
+    within = (distance_outside(xy, box) < config.margin_m) | _overhangs(xy, box, prior, config)
     counted = height < prior.count_max_height_m
     upper = within & counted & (height > config.upper_height_m)
     top = top_of(height[within & counted], float(prior.count_max_height_m), float(config.top_quantile))
@@ -198,6 +199,17 @@ def count_points_around(
         num_recessed=int((upper & (depth_behind_faces(xy, box) > prior.recess_m)).sum()),
         deepest=float(np.max(depth_behind_end(held, box), initial=0.0)),
     )
+
+
+def _overhangs(xy: np.ndarray, box: np.ndarray, prior: ClassPrior, config: VehicleConfig) -> np.ndarray:
+    """(n,) bool: points a little before the end that a sensor at the origin sees, of long vehicles."""
+    sensor, half_length = _in_box_frame(np.zeros(2), box), box[2] / 2
+    if abs(sensor[0]) <= half_length:
+        return np.zeros(len(xy), bool)
+    local = _in_box_frame(xy, box)
+    ahead = np.sign(sensor[0]) * local[:, 0]
+    reach_m = half_length + min(prior.past_ends_m, OVERHANG_M) + config.margin_m
+    return (ahead > 0) & (ahead < reach_m) & (np.abs(local[:, 1]) < box[3] / 2 + config.margin_m)
 
 
 def cluster_alone(num_points: int, top: float) -> NeighbourhoodCounts:
@@ -373,7 +385,7 @@ def score_box(
         config=config,
     )
     rho = float(np.hypot(box.box[0], box.box[1]))
-    return early * neighbourhood_score(around, rho, reach, prior, config)[0]
+    return early * neighbourhood_score(around, rho, reach, box.measured_width_m, prior, config)[0]
 
 
 def early_score(
@@ -444,7 +456,12 @@ def size_score(size: np.ndarray, prior: ClassPrior) -> float:
 
 
 def neighbourhood_score(
-    around: NeighbourhoodCounts, rho: float, reach: float, prior: ClassPrior, config: VehicleConfig
+    around: NeighbourhoodCounts,
+    rho: float,
+    reach: float,
+    seen_width_m: float,
+    prior: ClassPrior,
+    config: VehicleConfig,
 ) -> tuple[float, bool]:
     """The part of the score that the points in and round the box decide.
 
@@ -453,6 +470,7 @@ def neighbourhood_score(
       rho: m, range of the box: it may be higher than its top by `top_grade` times this.
       reach: m above the ground: where the box begins, the highest beam passes there, and cuts off what is
         higher. A top that comes near to it may lie anywhere above, for `cut_score` of the score.
+      seen_width_m: m, measured: that share of it falls with the width below half the class's.
       prior: of the class.
       config: exp(-(ring weight x ring + overhead weight x above) / inside), and a factor from
         `upright_score`, where no upper point is recessed, to 1 from the share `recess_share` on. Points above
@@ -468,6 +486,7 @@ def neighbourhood_score(
         seen = asymmetric_gaussian(min(max(prior.height_m, around.top), highest), *widths)
     if prior.min_cut_height_m < around.top < prior.max_height_m:
         share = min(max(1 + (around.top - reach) / CUT_SLACK_M, 0.0), 1.0)
+        share *= min(2 * seen_width_m / prior.width_m, 1.0)
         cut = float(config.cut_score * share) * asymmetric_gaussian(max(prior.height_m, around.top), *widths)
     score = max(seen, cut)
     gap = prior.count_max_height_m - highest

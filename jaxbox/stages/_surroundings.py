@@ -40,8 +40,8 @@ the second, go on along that side: they are of what the box holds a part of."""
 
 
 OVERHANG_M = 0.6
-"""Where points past the ends speak against a vehicle (`ClassPrior.past_ends_m`), those up to here are its
-own: cargo bodies reach beyond the bumpers and wheels that a box is fitted to."""
+"""Where points past the ends speak against a vehicle (`ClassPrior.past_ends_m`), those up to here before the
+end that the sensor sees are its own: cargo bodies reach beyond the bumpers that a box is fitted to."""
 
 
 def count_points_around(
@@ -190,7 +190,11 @@ def _judge(
     is_along = jnp.abs(toward_v - side_v) < SIDE_HALF_M
     is_behind = (toward_v < far_v) | (toward_u < far_u) & ~is_along
     out_u, out_v = jnp.abs(u), jnp.where(valid & ~is_behind, jnp.abs(v) - half_w, jnp.inf)
-    body_half_l = half_l + jnp.minimum(ring_half_l - half_l, OVERHANG_M)
+    # The depth behind a face is finite where the sensor sees the face.
+    overhang = jnp.where(
+        (toward_u > 0) & (near_u < jnp.inf), jnp.minimum(ring_half_l - half_l, OVERHANG_M), 0
+    )
+    body_half_l = half_l + overhang
     inside, low = jnp.maximum(out_u - body_half_l, out_v) < config.margin_m, height < max_height
     upper = inside & low & (height > config.upper_height_m)
     recessed = upper & (toward_u < near_u) & (toward_v < near_v)

@@ -84,21 +84,21 @@ def score_boxes(
         size = jnp.stack([box.length, box.width, wrap_yaw(box.yaw)], axis=1)
         rectangle = jnp.concatenate([box.center, size], axis=1)
         of_hypothesis = take(hypotheses.label, chosen), take(hypotheses.cluster, chosen)
-        return rectangle, *of_hypothesis, take(score, chosen)
+        return rectangle, *of_hypothesis, take(score, chosen), box.measured[:, 1]
 
     picked = map_rows(pick, chosen, num_rows=num)
-    rectangle, label, cluster, early = picked
+    rectangle, label, cluster, early, _ = picked
     around = _look_around(rectangle, label, cluster, early, num, clusters, obstacles, config)
 
     def finish(rows: tuple[Any, ...]) -> Candidates:
-        rectangle, label, cluster, early, around = rows
+        rectangle, label, cluster, *others, around = rows
         if config.vehicles.neighbourhood and config.completion.mode != "none":
             rectangle = _end_where_seen(rectangle, label, around, config)
         z = jnp.zeros_like(rectangle[:, 0]) if lowest_z is None else take(lowest_z, cluster)
         ground = ground_elevation(jnp.concatenate([rectangle[:, :2], z[:, None]], axis=1))
         nearest = jnp.linalg.norm(rectangle[:, :2], axis=1) - rectangle[:, 2] / 2
         reach = NOT_CUT_M * jnp.ones_like(ground) if steepest is None else steepest * nearest - ground
-        candidates = _finish((rectangle, label, cluster, early, around), reach, clusters, settings)
+        candidates = _finish((rectangle, label, cluster, *others, around), reach, clusters, settings)
         return dataclasses.replace(candidates, bottom=candidates.bottom + ground)
 
     candidates = map_rows(finish, (*picked, around), num_rows=num)
@@ -165,10 +165,10 @@ def _end_where_seen(
 
 def _finish(rows: tuple[Any, ...], reach: jax.Array, clusters: Clusters, config: VehicleConfig) -> Candidates:
     """Candidates with their score and height, bottoms above the ground, in the order that they came in."""
-    rectangle, label, cluster, score, around = rows
+    rectangle, label, cluster, score, seen_width_m, around = rows
     prior = prior_of(config.classes, label)
     rho = jnp.linalg.norm(rectangle[:, :2], axis=1)
-    late, is_cut = neighbourhood_score(around, rho, reach, prior, config)
+    late, is_cut = neighbourhood_score(around, rho, reach, seen_width_m, prior, config)
     height = jnp.maximum(around.top + config.top_margin_m, prior.min_box_height_m)
     height = jnp.where(is_cut, jnp.maximum(height, prior.height_m), height)
     bottom = jnp.zeros_like(height)
@@ -284,7 +284,12 @@ def end_where_seen(
 
 
 def neighbourhood_score(
-    around: NeighbourhoodCounts, rho: jax.Array, reach: jax.Array, prior: ClassPrior, config: VehicleConfig
+    around: NeighbourhoodCounts,
+    rho: jax.Array,
+    reach: jax.Array,
+    seen_width_m: jax.Array,
+    prior: ClassPrior,
+    config: VehicleConfig,
 ) -> tuple[jax.Array, jax.Array]:
     """The part of the score that the points in and round the box decide.
 
@@ -296,6 +301,8 @@ def neighbourhood_score(
       around: see `count_points_around`.
       rho: (P,) float32, m, range of the box.
       reach: (P,) float32, m above the ground: height of the highest beam where the box begins.
+      seen_width_m: (P,) float32, m: what was measured of the width. Of one long face nothing is known but its
+        length, which walls have too: only from half the usual width on may the top be out of sight.
       prior: fields of (P,) float32.
       config: exp(-(ring weight x ring + overhead weight x above) / inside), and what upright boxes lose:
         those with few upper points come near to the full score. Points above count as far as they are
@@ -310,7 +317,7 @@ def neighbourhood_score(
     connected = jnp.clip(2 - clearance / config.overhead_gap_m, 0, 1)
     overhead = config.overhead_weight * connected * around.num_above
     clutter = (config.ring_weight * around.num_ring + overhead) / jnp.maximum(around.num_inside, 1)
-    score, is_cut = _height_score(around.top, highest, reach, prior, config)
+    score, is_cut = _height_score(around.top, highest, reach, seen_width_m, prior, config)
     score = score * jnp.exp(-clutter)
     recessed = around.num_recessed + PSEUDO_COUNT * config.recess_share
     recessed = recessed / (around.num_upper + PSEUDO_COUNT)
@@ -321,7 +328,12 @@ def neighbourhood_score(
 
 
 def _height_score(
-    top: jax.Array, highest: jax.Array, reach: jax.Array, prior: ClassPrior, config: VehicleConfig
+    top: jax.Array,
+    highest: jax.Array,
+    reach: jax.Array,
+    seen_width_m: jax.Array,
+    prior: ClassPrior,
+    config: VehicleConfig,
 ) -> tuple[jax.Array, jax.Array]:
     """(P,) how well tops suit the class, and whether that is as the highest beam cuts the boxes off."""
     widths = prior.height_below_m, prior.height_above_m
@@ -329,6 +341,7 @@ def _height_score(
     seen = jnp.where(highest > prior.min_height_m, seen, 0)
     cut = config.cut_score * jnp.clip(1 + (top - reach) / CUT_SLACK_M, 0, 1)
     cut = cut * asymmetric_gaussian(jnp.maximum(prior.height_m, top), prior.height_m, *widths)
+    cut = cut * jnp.clip(2 * seen_width_m / prior.width_m, 0, 1)
     cut = jnp.where(top > prior.min_cut_height_m, cut, 0)
     return jnp.where(top < prior.max_height_m, jnp.maximum(seen, cut), 0), cut > seen
 
