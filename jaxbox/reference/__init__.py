@@ -109,22 +109,15 @@ from jaxbox.reference.rectangles import (
 from jaxbox.reference.scoring import (
     asymmetric_gaussian,
     bev_iou,
-    cluster_alone,
-    count_points_around,
-    depth_behind_end,
-    depth_behind_faces,
-    distance_outside,
     early_score,
     end_where_seen,
     evidence_score,
-    is_behind,
     keep_best,
     neighbourhood_score,
     non_max_suppression,
     score_box,
     score_boxes,
     size_score,
-    top_of,
 )
 from jaxbox.reference.state import (
     NO_CLUSTER,
@@ -144,6 +137,15 @@ from jaxbox.reference.state import (
     Rotations,
     ShapeDescriptors,
     Sweep,
+)
+from jaxbox.reference.surroundings import (
+    cluster_alone,
+    count_points_around,
+    depth_behind_end,
+    depth_behind_faces,
+    distance_outside,
+    is_behind,
+    top_of,
 )
 from jaxbox.reference.tracking import (
     track_step,

@@ -11,7 +11,6 @@ from jaxbox.reference.completion import is_large
 from jaxbox.reference.fronts import find_fronts
 from jaxbox.reference.ground import ground_elevation
 from jaxbox.reference.rectangles import wrap_yaw
-from jaxbox.reference.scoring import distance_outside
 from jaxbox.reference.state import (
     NO_CLUSTER,
     Candidate,
@@ -24,6 +23,7 @@ from jaxbox.reference.state import (
     ShapeDescriptors,
     Sweep,
 )
+from jaxbox.reference.surroundings import distance_outside
 
 INSIDE_TOLERANCE_M = 1e-3
 """A detection's points may lie this far outside its box: the box goes through the outermost of them."""

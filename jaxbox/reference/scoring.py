@@ -20,20 +20,12 @@ from jaxbox.reference.state import (
     Obstacles,
     RayFractions,
 )
+from jaxbox.reference.surroundings import cluster_alone, count_points_around, in_box_frame
 
 PSEUDO_COUNT = 5
 """Pseudo-count: upper points that are added, with the share of the full score behind the faces."""
 CUT_SLACK_M = 0.1
 """Tops from so much below the highest beam on are more and more taken to be cut off by it."""
-NUM_LEVELS = 20
-"""Levels of height by which the top is found."""
-SIDE_DEPTHS_M = -0.15, 0.35
-"""Points at these depths behind the long side that the sensor sees lie along it."""
-OVERHANG_M = 0.6
-"""Points so far before the end that the sensor sees are of the vehicle, where those beyond speak against
-it."""
-LOWEST_LEVEL = 0.4
-"""Where the levels begin, as a share of the highest that points of the vehicle may have."""
 SEEN_RAMP = 0.05
 """Share of the class's length over which a box goes from partly hidden to seen whole."""
 MAX_END_MARGIN_M = 0.4
@@ -141,172 +133,6 @@ def keep_best(candidates: Sequence[Candidate], config: VehicleConfig) -> Kept:
     return Kept([best[row] for row in rows[: config.max_detections]], len(rows))
 
 
-def distance_outside(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """How far points lie outside a box, along its worse axis; negative inside.
-
-    Args:
-      xy: (n, 2) m.
-      box: (5,): x, y, length, width in m and yaw in rad.
-
-    Returns:
-      (n,) m.
-    """
-    x, y, length, width, yaw = box
-    dx, dy = xy[:, 0] - x, xy[:, 1] - y
-    along = np.abs(dx * np.cos(yaw) + dy * np.sin(yaw)) - length / 2
-    across = np.abs(-dx * np.sin(yaw) + dy * np.cos(yaw)) - width / 2
-    return np.maximum(along, across)
-
-
-def count_points_around(
-    box: np.ndarray, prior: ClassPrior, obstacles: Obstacles, config: VehicleConfig, *, sure: float = 0.0
-) -> NeighbourhoodCounts:
-    """Counts the points of the whole sweep in and round a box.
-
-    Args:
-      box: (5,): x, y, length, width in m and yaw in rad.
-      prior: points lower than `count_max_height_m` belong to the vehicle, and those farther than `recess_m`
-        behind each face that the sensor sees are recessed; the ring reaches `past_ends_m` farther past the
-        ends.
-      obstacles: all points above the ground.
-      config: a point less than the margin outside counts as inside, one farther but less than the ring is in
-        the ring; which points are upper ones, and which share of those inside may lie above the top.
-      sure: in [0, 1], that the box ends where it does: points behind it are not counted, from the ring's end
-        on at 0, from the margin before the hidden face at 1.
-
-    Returns:
-      The counts.
-    """
-    if obstacles.tree is None:
-        return cluster_alone(0, 0.0)
-    longer = np.array([*box[:2], box[2] + 2 * prior.past_ends_m, *box[3:]])
-    reach_m = np.hypot(longer[2], longer[3]) / 2 + 2 * config.ring_m
-    near = obstacles.tree.query_ball_point(box[:2], reach_m)
-    xy, height = obstacles.xyz[near, :2], obstacles.height[near]
-    held = xy[(distance_outside(xy, box) < config.margin_m) & (height < prior.count_max_height_m)]
-    counted = ~is_behind(xy, box, config.ring_m - (config.ring_m + config.margin_m) * sure)
-    xy, height = xy[counted], height[counted]
-    within = (distance_outside(xy, box) < config.margin_m) | _overhangs(xy, box, prior, config)
-    counted = height < prior.count_max_height_m
-    upper = within & counted & (height > config.upper_height_m)
-    top = top_of(height[within & counted], float(prior.count_max_height_m), float(config.top_quantile))
-    return NeighbourhoodCounts(
-        num_inside=int((within & counted).sum()),
-        top=top,
-        num_above=int((within & ~counted).sum()),
-        num_ring=int((~within & (distance_outside(xy, longer) < config.ring_m) & counted).sum()),
-        num_upper=int(upper.sum()),
-        num_recessed=int((upper & (depth_behind_faces(xy, box) > prior.recess_m)).sum()),
-        deepest=float(np.max(depth_behind_end(held, box), initial=0.0)),
-    )
-
-
-def _overhangs(xy: np.ndarray, box: np.ndarray, prior: ClassPrior, config: VehicleConfig) -> np.ndarray:
-    """(n,) bool: points a little before the end that a sensor at the origin sees, of long vehicles."""
-    sensor, half_length = _in_box_frame(np.zeros(2), box), box[2] / 2
-    if abs(sensor[0]) <= half_length:
-        return np.zeros(len(xy), bool)
-    local = _in_box_frame(xy, box)
-    ahead = np.sign(sensor[0]) * local[:, 0]
-    reach_m = half_length + min(prior.past_ends_m, OVERHANG_M) + config.margin_m
-    return (ahead > 0) & (ahead < reach_m) & (np.abs(local[:, 1]) < box[3] / 2 + config.margin_m)
-
-
-def cluster_alone(num_points: int, top: float) -> NeighbourhoodCounts:
-    """What surrounds a box of which only the cluster is looked at: nothing.
-
-    Args:
-      num_points: of the cluster.
-      top: m above the ground, of the cluster.
-
-    Returns:
-      The counts.
-    """
-    return NeighbourhoodCounts(num_inside=num_points, top=top, num_above=0, num_ring=0)
-
-
-def top_of(height: np.ndarray, max_height_m: float, top_quantile: float) -> float:
-    """The height that a share of the points of a vehicle exceed, so that a stray return is not a roof.
-
-    Args:
-      height: (n,) m above the ground, below the next.
-      max_height_m: highest that they may have; points above 0.4 of it are counted in 20 levels.
-      top_quantile: of the points; those of a level count as spread evenly over it.
-
-    Returns:
-      m; at most the highest, and that where no point is in a level.
-    """
-    if len(height) == 0:
-        return 0.0
-    edges = np.linspace(LOWEST_LEVEL * max_height_m, max_height_m, NUM_LEVELS + 1)
-    left = top_quantile * len(height)
-    counts, _ = np.histogram(height, edges)
-    for count, low, high in zip(counts[::-1], edges[-2::-1], edges[:0:-1], strict=True):
-        if count > left:
-            return float(min(high - (high - low) * left / count, height.max()))
-        left -= count
-    return float(height.max())
-
-
-def is_behind(xy: np.ndarray, box: np.ndarray, behind_m: Scalar) -> np.ndarray:
-    """Points beyond the faces that a sensor at the origin does not see, because the box hides them.
-
-    Args:
-      xy: (n, 2) m.
-      box: (5,): x, y, length, width in m and yaw in rad.
-      behind_m: how far beyond.
-
-    Returns:
-      (n,) bool; not those beyond the far end that go on along the long side that the sensor sees.
-
-    >>> is_behind(np.array([[12.4, 0.9], [7.6, 0.0]]), np.array([10.0, 0, 4, 2, 0]), 0.1).tolist()
-    [True, False]
-    """
-    length, width = box[2:4]
-    local, sensor = _in_box_frame(xy, box), _in_box_frame(np.zeros(2), box)
-    sees = np.abs(sensor) > [length / 2, width / 2]
-    toward = local * np.sign(sensor)
-    beyond = sees & (toward < [-length / 2 - behind_m, -width / 2 - behind_m])
-    depth = width / 2 - toward[:, 1]
-    goes_on = sees[1] & (depth > SIDE_DEPTHS_M[0]) & (depth < SIDE_DEPTHS_M[1])
-    return beyond[:, 1] | (beyond[:, 0] & ~goes_on)
-
-
-def depth_behind_faces(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """How far points lie behind the nearest face that a sensor at the origin sees; negative in front.
-
-    Args:
-      xy: (n, 2) m.
-      box: (5,): x, y, length, width in m and yaw in rad.
-
-    Returns:
-      (n,) m; infinite where the sensor is inside the box.
-    """
-    local, sensor = _in_box_frame(xy, box), _in_box_frame(np.zeros(2), box)
-    depth = np.full(len(xy), np.inf)
-    for axis, half in enumerate((box[2] / 2, box[3] / 2)):
-        if abs(sensor[axis]) > half:
-            depth = np.minimum(depth, half - np.sign(sensor[axis]) * local[:, axis])
-    return depth
-
-
-def depth_behind_end(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """How far points lie behind the end of a box that is nearer to a sensor at the origin, along the box.
-
-    Args:
-      xy: (n, 2) m.
-      box: (5,): x, y, length, width in m and yaw in rad.
-
-    Returns:
-      (n,) m, negative before that end.
-
-    >>> depth_behind_end(np.array([[9.0, 0.3]]), np.array([10.0, 0, 4, 2, np.pi])).round(6).tolist()
-    [1.0]
-    """
-    facing = np.sign(_in_box_frame(np.zeros(2), box)[0])
-    return box[2] / 2 - facing * _in_box_frame(xy, box)[:, 0]
-
-
 def end_where_seen(
     box: np.ndarray,
     around: NeighbourhoodCounts,
@@ -327,7 +153,7 @@ def end_where_seen(
     Returns:
       (5,) the box with the same near end.
     """
-    sensor = _in_box_frame(np.zeros(2), box)
+    sensor = in_box_frame(np.zeros(2), box)
     along, across = np.maximum(np.abs(sensor) - box[2:4] / 2, 0)
     view = np.arctan2(across, along)
     weight = min(np.tan(min(view, 1.5)) / float(config.end_slope), 1.0)
@@ -339,12 +165,6 @@ def end_where_seen(
     near_end = box[:2] + np.sign(sensor[0]) * box[2] / 2 * np.array([np.cos(box[4]), np.sin(box[4])])
     center = near_end - np.sign(sensor[0]) * length / 2 * np.array([np.cos(box[4]), np.sin(box[4])])
     return np.array([*center, length, *box[3:]])
-
-
-def _in_box_frame(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """(..., 2) m: along and across the box, from its centre."""
-    cos, sin = np.cos(box[4]), np.sin(box[4])
-    return (xy - box[:2]) @ np.array([[cos, -sin], [sin, cos]])
 
 
 def score_box(
