@@ -11,8 +11,8 @@ import pytest
 
 from jaxbox import reference
 from jaxbox.geometry import planar
-from jaxbox.stages import _surroundings, scoring
-from jaxbox.stages.state import NeighbourhoodCounts, Obstacles
+from jaxbox.stages import _priors, _surroundings, scoring
+from jaxbox.stages.state import NeighbourhoodCounts, Obstacles, RayFractions
 from jaxbox.xla import backend
 
 SETTINGS = parity.CONFIG.vehicles
@@ -104,8 +104,9 @@ def score_boxes(columns, prior):
     seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "objective"))
     where = (columns[name] for name in ("rho", "reach", "seen_width"))
     early = scoring.evidence_score(*seen, SETTINGS)
-    late, _ = scoring.neighbourhood_score(around, *where, prior, SETTINGS)
-    return early * scoring.size_score(columns["length"], columns["width"], prior) * late * prior.prior_weight
+    late, is_cut = scoring.neighbourhood_score(around, *where, prior, SETTINGS)
+    by_size = scoring.size_score(columns["length"], columns["width"], prior)
+    return early * by_size * late * prior.prior_weight, is_cut
 
 
 @jax.jit
@@ -127,11 +128,11 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
         "support": rng.integers(0, 30, MAX_BOXES),
         "objective": rng.uniform(2, 3, MAX_BOXES),
         "rho": rng.uniform(2, 80, MAX_BOXES),
-        "reach": rng.uniform(1, 6, MAX_BOXES),
+        "reach": rng.uniform(0.5, 4, MAX_BOXES),
         "seen_width": rng.uniform(0, 2.5, MAX_BOXES),
         "around": [
             rng.integers(1, 400, MAX_BOXES),
-            prior.height_m + rng.normal(0, 0.5, MAX_BOXES),
+            np.where(rng.random(MAX_BOXES) < 0.5, prior.height_m, 1.5) + rng.normal(0, 0.5, MAX_BOXES),
             rng.integers(0, 20, MAX_BOXES),
             rng.integers(0, 20, MAX_BOXES),
             upper := rng.integers(0, 20, MAX_BOXES),
@@ -140,10 +141,10 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
         ],
     }
     columns, prior = jax.tree.map(np.float32, (columns, prior))
-    scores = np.asarray(score_boxes(columns, prior))
-    expected = []
+    scores, is_cut = jax.device_get(score_boxes(columns, prior))
+    expected, expected_cut = [], []
     for row in range(MAX_BOXES):
-        around = (float(value[row]) for value in columns["around"])
+        around = reference.NeighbourhoodCounts(*(float(value[row]) for value in columns["around"]))
         one = {name: float(columns[name][row]) for name in ("hit", "free_length", "support")}
         length, width, seen_width = (float(columns[name][row]) for name in ("length", "width", "seen_width"))
         box = np.array([columns["rho"][row], 0.0, length, width, 0.0])
@@ -151,17 +152,37 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
             reference.score_box(
                 reference.CompletedBox(box, float(columns["objective"][row]), length, seen_width),
                 SETTINGS.classes[label[row]],
-                around=reference.NeighbourhoodCounts(*around),
+                around=around,
                 num_points=int(columns["num_points"][row]),
                 **one,
                 config=SETTINGS,
                 reach=float(columns["reach"][row]),
             )
         )
+        where = (float(columns[name][row]) for name in ("rho", "reach", "seen_width"))
+        late = reference.neighbourhood_score(around, *where, SETTINGS.classes[label[row]], SETTINGS)
+        expected_cut.append(late[1])
     expected = np.array(expected)
     np.testing.assert_allclose(scores, expected, rtol=2e-4, atol=1e-7)
     assert (expected == 0).sum() > 50
     assert (expected > 0.05).sum() > 50
+    np.testing.assert_array_equal(is_cut, expected_cut)
+    assert 20 < sum(expected_cut) < MAX_BOXES - 20
+
+
+def test_free_space_below_a_body_counts_as_in_the_reference():
+    rng = np.random.default_rng(0)
+    free, free_length = rng.random((2, MAX_BOXES)).astype(np.float32)
+    nothing = np.zeros(MAX_BOXES, np.float32)
+    rays = RayFractions(1 - free, free, nothing, nothing, free_length)
+    for open_below in (0.0, 0.4, 1.0, 1.2):
+        prior = dataclasses.replace(SETTINGS.classes[0], open_below=open_below)
+        ours = _priors.closed_free_length(rays, prior)
+        theirs = reference.closed_free_length(rays, prior)
+        np.testing.assert_allclose(ours, theirs, atol=1e-6)
+    assert (ours <= free + 1e-6).all()
+    unchanged = _priors.closed_free_length(rays, dataclasses.replace(prior, open_below=0.0))
+    np.testing.assert_array_equal(unchanged, free_length)
 
 
 def test_far_ends_are_where_the_reference_sees_them():

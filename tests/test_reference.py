@@ -533,7 +533,7 @@ def test_without_evidence_every_ray_counts_as_hit_and_the_ground_is_not_looked_a
     completed = reference.Completed([reference.ClassHypothesis(0, Label.CAR)], [box], 1)
     config = DetectorConfig.paper()
     nothing = reference.index_obstacles(np.zeros((0, 3)), np.zeros(0), np.zeros(0, int))
-    (candidate,) = reference.score_boxes(completed, None, lambda _: np.inf, [cluster], nothing, config)
+    (candidate,) = reference.score_boxes(completed, None, lambda *_: np.inf, [cluster], nothing, config)
     around = reference.cluster_alone(50, 1.5)
     found = {"hit": 1.0, "free_length": 0.0, "support": None}
     expected = reference.score_box(box, CAR, around=around, num_points=50, **found, config=config.vehicles)
@@ -776,7 +776,7 @@ CORNERS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]])
 
 
 def test_the_far_end_of_a_side_that_is_seen_is_at_its_last_point_and_a_hidden_one_stays():
-    rule = dataclasses.replace(COMPLETION, seen_length=0.6, end_slope=0.2, end_points=50.0)
+    rule = dataclasses.replace(COMPLETION, end_length=0.6, end_slope=0.2, end_points=50.0)
     around = reference.NeighbourhoodCounts(num_inside=150, top=1.5, num_above=0, num_ring=0, deepest=3.2)
 
     def length(box, **changes):
@@ -848,6 +848,20 @@ def score_of(box=PERFECT_BOX, prior=CAR, *, objective=np.inf, measured=(3.9, 1.6
     return reference.score_box(completed, prior, **(PERFECT | faults), config=SCORE)
 
 
+def test_the_highest_beam_is_where_it_passes_the_nearest_point_of_a_box():
+    def even(xyz):
+        return np.full(len(xyz), -1.7)
+
+    for box, nearest_m in (
+        ([12.0, 0, 4, 2, 0], 10),
+        ([0, 12.0, 4, 2, 0], 11),
+        ([15.0, 10, 4, 2, 0], 13 * np.hypot(1, 9 / 13)),
+    ):
+        reach = reference.reach_of_beams(np.array(box), 0.0, 0.1, even)
+        assert reach == pytest.approx(1.7 + 0.1 * nearest_m)
+    assert reference.reach_of_beams(np.array([12.0, 0, 4, 2, 0]), 0.0, None, even) == np.inf
+
+
 def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     score, around = score_of, PERFECT["around"]
     assert score() == 1
@@ -875,6 +889,13 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     )
     assert score(around=dataclasses.replace(around, num_upper=50)) == pytest.approx(0.2 + 0.8 * 2 / 55 / 0.4)
     assert score(around=dataclasses.replace(around, num_upper=10**6)) == pytest.approx(0.2, abs=1e-4)
+    # Where the highest beam cuts the top off, the height says nothing, if half the width was measured.
+    cut = dataclasses.replace(around, top=0.8)
+    assert score(around=cut) == 0
+    assert score(around=cut, reach=0.8) == pytest.approx(0.7)
+    assert score(around=cut, reach=0.85) == pytest.approx(0.35)
+    assert score(around=cut, reach=0.95) == 0
+    assert score(around=cut, reach=0.8, measured=(3.9, 1.63 / 4)) == pytest.approx(0.35)
     # A top that reads low far away may be higher by the range allowance.
     low = dataclasses.replace(around, top=1.2)
     assert score(around=low) == pytest.approx(np.exp(-((0.225 / 0.3) ** 2)))

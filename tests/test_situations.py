@@ -26,8 +26,10 @@ IN_SHORT = {
     "very near: middle 3 m away": 15,
     "under a ceiling: 2.3 m": 6,
     "under a ceiling: 3 m": 6,
-    "other sizes: box vans": 3,
+    "other sizes: box vans": 4,
+    "other sizes: trucks of 9 m": 4,
     "mounts: on a slope of 10 %": 9,
+    "mounts: before a ramp of 10 %": 6,
 }
 """Situations that the suite runs, and how many vehicles are to be found in each."""
 

@@ -27,7 +27,7 @@ class ClassPrior:
     width_m: Scalar
     """Hidden widths are completed to this, and scored against it."""
     height_m: Scalar
-    """Heights are scored against this."""
+    """Heights are scored against this; boxes that the highest beam cuts off have it."""
     length_below_m: Scalar
     """Width of the length score below the prior, exp(-(d / w)^2)."""
     length_above_m: Scalar
@@ -60,10 +60,10 @@ class ClassPrior:
     and fences are upright. -1 asks for nothing."""
     past_ends_m: Scalar
     """Points so much farther past the ends of the box speak against it too, see ``vehicles.ring_m``: walls
-    and facades go on there."""
+    and facades go on there. Those up to .6 m before the end that the sensor sees are its own."""
     open_below: Scalar
-    """Share of the free space behind hits that is no evidence against such a vehicle: 1 where beams pass
-    below the body, 0 where they do not."""
+    """Share of the free space behind hits that is no evidence against such a vehicle: 1 or more where beams
+    pass below the body, 0 where they do not."""
 
 
 _FRONT_PROFILES = {

@@ -114,12 +114,12 @@ class GroundConfig:
     envelope_margin_m: Scalar = 0.1
     """A cell minimum within this of the lower envelope is ground."""
     sheet_tolerance_m: Scalar = 0.04
-    """Smooth sheets of 5 x 5 m, such as ramps, are ground, however fast they rise there: they deviate from a
-    plane by less than this in the mean. 0 takes none."""
+    """Smooth sheets of 10 x 10 cells, such as ramps, are ground, also where they rise by more than
+    ``max_grade``: they deviate from a plane by less than this in the mean. 0 takes none."""
     max_sheet_grade: Scalar = 0.25
     """Steepest rise of such a sheet relative to the plane, m/m."""
     sheet_band_grade: Scalar = 0.2
-    """Growth with range of the band in which sheets are looked for, m/m."""
+    """Growth with range of the band in which sheets are looked for, m/m; it begins at ``band_above_m``."""
     min_support_share: Scalar = 0.05
     """Ground has, within 3 m, at least this share of the points up to 1.2 m above it at about its height
     (.1 to .2 m); what lies below is a reflection. 0 asks for none."""
@@ -264,7 +264,7 @@ class CompletionConfig:
     along_scene: bool = _static(default=True)
     """static: let the evidence also judge the rectangle along the scene's direction, where that is not
     the best rotation by itself; needs ``box.scene_direction``."""
-    seen_length: Scalar = 0.67
+    seen_length: Scalar = 0.72
     """A side measured at least this long, as a fraction of the class's length, may be seen whole."""
     seen_width: Scalar = 0.83
     """As ``seen_length``, for the width."""
@@ -274,11 +274,13 @@ class CompletionConfig:
     """Lengths read short by this: bumpers are round, and the far one is seen last."""
     width_margin_m: Scalar = 0.06
     """Widths read short by this."""
+    end_length: Scalar = 0.67
+    """From this fraction of the class's length on the farthest of all points inside a box tells where it
+    ends; not in mode "none", nor without ``vehicles.neighbourhood``."""
     end_slope: Scalar = 0.25
-    """Slope of the beams against the long side from which on the farthest point inside the box tells where
-    its length ends."""
+    """It is believed in full where beams meet the long side at this slope or more."""
     end_points: Scalar = 50.0
-    """Points inside the box at which that weighs half."""
+    """Points inside the box at which it is believed half."""
     max_assignments: int = _static(default=4096)
     """static: capacity for sides of rectangles that the evidence weighs as the length of a class."""
     num_rays: int = _static(default=32)
@@ -346,7 +348,8 @@ class VehicleConfig:
     """score x exp(-weight x points above / points), where those above are connected to the vehicle."""
     cut_score: Scalar = 0.7
     """Score of the height where the highest beam cuts a vehicle off below its usual height, so that the
-    height is not known. 0 takes the top of the points for that of the vehicle."""
+    height is not known, and the class's is answered; less where less than half of the class's width was
+    measured. 0 takes the top of the points for that of the vehicle."""
     overhead_gap_m: Scalar = 0.25
     """They are connected where the gap between its top and the height from which points are above is at most
     this, and are not where it is twice this: a ceiling or a crown is no part of what stands under it."""

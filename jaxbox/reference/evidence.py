@@ -295,7 +295,7 @@ def closed_free_length(rays: RayFractions, prior: ClassPrior) -> np.ndarray:
       (B,).
     """
     beside = np.minimum(rays.free_length, rays.free)
-    return rays.free_length + float(prior.open_below) * (beside - rays.free_length)
+    return rays.free_length + min(float(prior.open_below), 1.0) * (beside - rays.free_length)
 
 
 def _ray_angles(boxes: np.ndarray, num_rays: int) -> np.ndarray:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import expit
 
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, Scalar, VehicleConfig
+from jaxbox.reference.completion import SEEN_RAMP
 from jaxbox.reference.evidence import GroundElevation, closed_free_length
 from jaxbox.reference.state import (
     Candidate,
@@ -26,8 +27,6 @@ PSEUDO_COUNT = 5
 """Pseudo-count: upper points that are added, with the share of the full score behind the faces."""
 CUT_SLACK_M = 0.1
 """Tops from so much below the highest beam on are more and more taken to be cut off by it."""
-SEEN_RAMP = 0.05
-"""Share of the class's length over which a box goes from partly hidden to seen whole."""
 MAX_END_MARGIN_M = 0.4
 """An end lies no farther beyond the last point than this."""
 
@@ -35,7 +34,7 @@ MAX_END_MARGIN_M = 0.4
 def score_boxes(
     completed: Completed,
     rays: tuple[RayFractions, np.ndarray] | None,
-    reach: Callable[[np.ndarray], float],
+    reach: Callable[[np.ndarray, float], float],
     clusters: Sequence[Cluster],
     obstacles: Obstacles,
     config: DetectorConfig,
@@ -45,7 +44,8 @@ def score_boxes(
     Args:
       completed: q boxes.
       rays: what the rays over each box met, and the ground support round it; None without evidence.
-      reach: how high the highest beam is where a box (5,) begins, m, see `reach_of_beams`.
+      reach: how high the highest beam is over a box (5,) whose lowest point has some z, see
+        `reach_of_beams`.
       clusters: of all maps.
       obstacles: all points above the ground.
       config: of the detector.
@@ -75,7 +75,8 @@ def score_boxes(
             seen = end_where_seen(box.box, around, float(prior.length_m), config.completion, beam_angle)
             box = dataclasses.replace(box, box=seen)
         rho = float(np.hypot(box.box[0], box.box[1]))
-        where = rho, reach(box.box), box.measured_width_m
+        lowest_z = obstacles.xyz[cluster.members, 2].min() if config.ground.max_planes > 1 else 0.0
+        where = rho, reach(box.box, lowest_z), box.measured_width_m
         late, is_cut = neighbourhood_score(around, *where, prior, config.vehicles)
         return Candidate(hypothesis, box, around, is_cut, early * late)
 
@@ -85,11 +86,14 @@ def score_boxes(
     return sorted(candidates, key=lambda candidate: -candidate.score)
 
 
-def reach_of_beams(box: np.ndarray, steepest: float | None, elevation: GroundElevation) -> float:
-    """How high the highest beam is where a box begins.
+def reach_of_beams(
+    box: np.ndarray, lowest_z: float, steepest: float | None, elevation: GroundElevation
+) -> float:
+    """How high the highest beam is at the nearest point of a box.
 
     Args:
       box: (5,): x, y, length, width in m and yaw in rad.
+      lowest_z: m, of its points: it tells which of several planes it stands on.
       steepest: rise of that beam, m/m; None where nothing is known of it.
       elevation: z of the ground, m, under points.
 
@@ -98,8 +102,8 @@ def reach_of_beams(box: np.ndarray, steepest: float | None, elevation: GroundEle
     """
     if steepest is None:
         return np.inf
-    nearest = np.hypot(*box[:2]) - box[2] / 2
-    return float(steepest * nearest - elevation(np.array([[*box[:2], 0.0]]))[0])
+    nearest = np.hypot(*np.maximum(np.abs(in_box_frame(np.zeros(2), box)) - box[2:4] / 2, 0))
+    return float(steepest * nearest - elevation(np.array([[*box[:2], lowest_z]]))[0])
 
 
 def _look_around(
@@ -146,9 +150,9 @@ def end_where_seen(
       box: (5,): x, y, length, width in m and yaw in rad.
       around: all points inside; the farthest tells where the end is.
       usual_m: length of the class.
-      config: `seen_length` of the class's length is the least that shows an end; from `end_slope` on beams
+      config: `end_length` of the class's length is the least that shows an end; from `end_slope` on beams
         show it for sure, and `end_points` points half so.
-      beam_angle: rad, between neighbouring beams.
+      beam_angle: rad, between neighbouring beams: an azimuth cell of the evidence.
 
     Returns:
       (5,) the box with the same near end.
@@ -157,7 +161,7 @@ def end_where_seen(
     along, across = np.maximum(np.abs(sensor) - box[2:4] / 2, 0)
     view = np.arctan2(across, along)
     weight = min(np.tan(min(view, 1.5)) / float(config.end_slope), 1.0)
-    weight *= np.interp(around.deepest / usual_m - float(config.seen_length), [0, SEEN_RAMP], [0, 1])
+    weight *= np.interp(around.deepest / usual_m - float(config.end_length), [0, SEEN_RAMP], [0, 1])
     weight *= around.num_inside / (around.num_inside + float(config.end_points))
     # Beams that meet the side at that angle, so far away, are so far apart on it.
     spacing_m = beam_angle * np.hypot(along, across) / np.sin(view) if view > 0 else np.inf

@@ -57,9 +57,11 @@ def closed_free_length(rays: RayFractions, prior: ClassPrior) -> jax.Array:
 
     Returns:
       (..., P) float32: the free length of all rays, or no more than the fraction that hit nothing.
+
+    Reference: oracle `jaxbox.reference.closed_free_length`.
     """
     beside = jnp.minimum(rays.free_length, rays.free)
-    share = jnp.broadcast_to(prior.open_below, beside.shape)
+    share = jnp.broadcast_to(jnp.minimum(prior.open_below, 1), beside.shape)
     return rays.free_length + share * (beside - rays.free_length)
 
 

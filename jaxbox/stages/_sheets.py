@@ -13,8 +13,9 @@ SHEET_HALF_M, SHEET_REACH, MIN_SHEET_SQUARES = 40.0, 2, 17
 """Sheets are looked for this near, in windows of 5 x 5 squares of which so many are not empty."""
 
 
-SHEET_STEP_M = 0.2
-"""Cells of a square are on its sheet up to this above it: a square of a ramp is not level."""
+SHEET_STEP_M, SQUARE_TOLERANCE_M = 0.2, 0.1
+"""Cells of a square are on its sheet up to the first above it: a square of a ramp is not level. And a square
+is on the sheet of its window up to the second off it."""
 
 
 SQUARE_CELLS = 2
@@ -25,8 +26,8 @@ def on_sheets(lowest: jax.Array, config: GroundConfig) -> jax.Array:
     """Cells that lie on a smooth sheet, wider than any vehicle: ramps, which the envelope takes for things.
 
     Squares of 2 x 2 cells stand for their lowest. Where most of 5 x 5 are within a tolerance of a plane, in
-    the mean, and the plane is no steeper than roads may be, the one in the middle is on a sheet. Roofs and
-    bonnets are too small for that, hedges too rough.
+    the mean, and the plane is no steeper than `max_sheet_grade`, the one in the middle is on a sheet. Roofs
+    and bonnets are too small for that, hedges too rough.
 
     Args:
       lowest: (X, Y) float32, m above the plane; infinite where a cell is empty.
@@ -48,7 +49,7 @@ def on_sheets(lowest: jax.Array, config: GroundConfig) -> jax.Array:
     num, level, rise, rms = planes_through_windows(square)
     is_sheet = (num >= MIN_SHEET_SQUARES) & (rms < config.sheet_tolerance_m)
     is_sheet = is_sheet & (rise < config.max_sheet_grade * SQUARE_CELLS * config.surface_cell_m)
-    is_sheet = is_sheet & (jnp.abs(square - level) < SHEET_STEP_M / 2)
+    is_sheet = is_sheet & (jnp.abs(square - level) < SQUARE_TOLERANCE_M)
     level = jnp.where(is_sheet, level, -jnp.inf).repeat(SQUARE_CELLS, 0).repeat(SQUARE_CELLS, 1)
     level = level[: n - 2 * margin, : n - 2 * margin]
     return lowest < jnp.pad(level, margin, constant_values=-jnp.inf) + SHEET_STEP_M
@@ -64,7 +65,7 @@ def planes_through_windows(square: jax.Array) -> tuple[jax.Array, ...]:
       num: (S, S) float32, squares in the window that are not empty.
       level: (S, S) float32, m: of the plane in the middle of the window; 0 where no plane is determined.
       rise: (S, S) float32, m a square: of the plane; infinite there.
-      rms: (S, S) float32, m: deviations from it.
+      rms: (S, S) float32, m: deviations from it; nothing where no plane is determined.
 
     Reference: oracle `jaxbox.reference.planes_through_windows`.
     """
@@ -84,7 +85,7 @@ def planes_through_windows(square: jax.Array) -> tuple[jax.Array, ...]:
     xx, xy, yy = xx - x * x / count, xy - x * y / count, yy - y * y / count
     xs, ys, ss = xs - x * s / count, ys - y * s / count, ss - s * s / count
     det = xx * yy - xy * xy
-    is_plane = det > 0.5
+    is_plane = det > 0.25
     det = jnp.where(is_plane, det, 1)
     a, b = (yy * xs - xy * ys) / det, (xx * ys - xy * xs) / det
     rms = jnp.sqrt(jnp.maximum(ss - a * xs - b * ys, 0) / count)

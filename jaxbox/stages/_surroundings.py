@@ -126,6 +126,20 @@ def cluster_alone(num_points: jax.Array, top: jax.Array) -> NeighbourhoodCounts:
     return NeighbourhoodCounts(jnp.stack([num_points, top, none, none, none, none, none], axis=1))
 
 
+def sensor_from(boxes: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Where the sensor, at the origin, is in the frames of boxes.
+
+    Args:
+      boxes: (P, 5) float32: x, y, length, width (m), yaw (rad).
+
+    Returns:
+      (P,) float32 each, m from their centres: along and across.
+    """
+    x, y, _, _, yaw = boxes.T
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    return -(x * cos + y * sin), x * sin - y * cos
+
+
 def _frames(
     boxes: jax.Array,
     count_max_height_m: jax.Array,
@@ -137,8 +151,8 @@ def _frames(
     x, y, length, width, yaw = boxes.T
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     half_l, half_w = length / 2, width / 2
-    # The sensor at the origin, in the box's frame: it sees the faces on its side of the box.
-    sensor_u, sensor_v = -(x * cos + y * sin), x * sin - y * cos
+    # The sensor sees the faces on its side of the box.
+    sensor_u, sensor_v = sensor_from(boxes)
     sides = (sensor_u, half_l), (sensor_v, half_w)
     near = [jnp.where(jnp.abs(sensor) > half, half - recess_m, jnp.inf) for sensor, half in sides]
     far = [jnp.where(jnp.abs(sensor) > half, -half - behind_m, -jnp.inf) for sensor, half in sides]

@@ -158,7 +158,8 @@ def steepest_beam(z: jax.Array, rho: jax.Array, mask: jax.Array) -> jax.Array:
       mask: (N,) bool, points that count.
 
     Returns:
-      () float32, m/m: what 30 points exceed, and at least .03.
+      () float32, m/m: what 30 points have or exceed, and at least .03. Where the highest beams meet nothing,
+      it is that of the highest that returns.
 
     Reference: oracle `jaxbox.reference.steepest_beam`.
     """

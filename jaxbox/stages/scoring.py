@@ -12,7 +12,7 @@ from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, VehicleC
 from jaxbox.geometry.planar import rectangle_iou, wrap_yaw
 from jaxbox.stages._assignments import SEEN_RAMP
 from jaxbox.stages._priors import asymmetric_gaussian, closed_free_length, prior_of, size_score
-from jaxbox.stages._surroundings import cluster_alone, count_points_around
+from jaxbox.stages._surroundings import cluster_alone, count_points_around, sensor_from
 from jaxbox.stages.state import (
     NOT_A_BOX,
     Boxes,
@@ -96,7 +96,7 @@ def score_boxes(
             rectangle = _end_where_seen(rectangle, label, around, config)
         z = jnp.zeros_like(rectangle[:, 0]) if lowest_z is None else take(lowest_z, cluster)
         ground = ground_elevation(jnp.concatenate([rectangle[:, :2], z[:, None]], axis=1))
-        nearest = jnp.linalg.norm(rectangle[:, :2], axis=1) - rectangle[:, 2] / 2
+        nearest = jnp.hypot(*_distances_outside(rectangle))
         reach = NOT_CUT_M * jnp.ones_like(ground) if steepest is None else steepest * nearest - ground
         candidates = _finish((rectangle, label, cluster, *others, around), reach, clusters, settings)
         return dataclasses.replace(candidates, bottom=candidates.bottom + ground)
@@ -153,6 +153,13 @@ def _look_around(
     dense = jnp.minimum(num_points.astype(jnp.float32) / config.vehicles.saturation_points, 1)
     sure = early * dense**2
     return count_points_around(rectangle, prior, sure, num, obstacles, config.vehicles, config.region)
+
+
+def _distances_outside(rectangles: jax.Array) -> list[jax.Array]:
+    """(P,) m each: how far the sensor is from rectangles (P, 5), along and across."""
+    half = rectangles[:, 2:4].T / 2
+    sensor = sensor_from(rectangles)
+    return [jnp.maximum(jnp.abs(place) - size, 0) for place, size in zip(sensor, half, strict=True)]
 
 
 def _end_where_seen(
@@ -258,9 +265,9 @@ def end_where_seen(
       rectangles: (P, 5) float32: x, y, length, width (m), yaw (rad).
       around: all points inside; those as far apart as the class is long, and more, show the end.
       usual_m: (P,) float32, of the class.
-      config: from which fraction of the class's length on a box may be seen whole, at which slope of the
-        beams against the side its end is sure, and how many points make it half so.
-      beam_angle: rad, between neighbouring beams.
+      config: from which fraction of the class's length on the points may show the end, at which slope of
+        the beams against the side it is sure, and how many points make it half so.
+      beam_angle: rad, between neighbouring beams: an azimuth cell of the evidence.
 
     Returns:
       (P, 5) float32: the near ends stay.
@@ -268,19 +275,15 @@ def end_where_seen(
     Reference: oracle `jaxbox.reference.end_where_seen`.
     """
     x, y, length, width, yaw = rectangles.T
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    # The sensor at the origin, in the box's frame, and how far from the box along and across.
-    sensor_u, sensor_v = -(x * cos + y * sin), x * sin - y * cos
-    along = jnp.maximum(jnp.abs(sensor_u) - length / 2, 0)
-    across = jnp.maximum(jnp.abs(sensor_v) - width / 2, 0)
+    along, across = _distances_outside(rectangles)
     steep = jnp.minimum(across / jnp.maximum(along, 1e-3) / config.end_slope, 1)
-    whole = jnp.clip((around.deepest / usual_m - config.seen_length) / SEEN_RAMP, 0, 1)
+    whole = jnp.clip((around.deepest / usual_m - config.end_length) / SEEN_RAMP, 0, 1)
     dense = around.num_inside / (around.num_inside + config.end_points)
     spacing_m = beam_angle * (along**2 + across**2) / jnp.maximum(across, 1e-3)
     seen_m = around.deepest + jnp.minimum(spacing_m / 2, MAX_END_MARGIN_M)
     answered = length + steep * whole * dense * (seen_m - length)
-    shift = jnp.sign(sensor_u) * (length - answered) / 2
-    return jnp.stack([x + shift * cos, y + shift * sin, answered, width, yaw], axis=1)
+    shift = jnp.sign(sensor_from(rectangles)[0]) * (length - answered) / 2
+    return jnp.stack([x + shift * jnp.cos(yaw), y + shift * jnp.sin(yaw), answered, width, yaw], axis=1)
 
 
 def neighbourhood_score(

@@ -306,7 +306,7 @@ class NeighbourhoodCounts:
 
     @property
     def num_inside(self) -> jax.Array:
-        """(P,) points of vehicle height inside, give or take the margin."""
+        """(P,) points of vehicle height inside, give or take the margin, and before the visible end."""
         return self.rows[:, 0]
 
     @property
