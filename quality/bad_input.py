@@ -22,7 +22,7 @@ PRESETS = ("default", "paper")
 
 MILLION = 1_000_000
 
-FAINT_SUPPORT = 0.5
+FAINT_SUPPORT = 0.375
 """A box worth acting on holds as many points of the input as a cluster needs. One that scores less may hold
 this share of them: the evidence may shift a box so that it leaves some of its cluster's points outside."""
 

@@ -178,7 +178,7 @@ class Tracks(BoxRows[Track]):
     mean of that and the detection's own, which tells how good this box is."""
     center: jax.Array
     """(T, 3) float32, m, sensor frame of this sweep: of the detection's box where there is one, else where
-    the track is expected."""
+    the track is expected. After the second pass: of the track, where it moves."""
     size: jax.Array
     """(T, 3) float32, m: length, width, height, likewise; of a track of some detections, the length that
     they agree on, with the faces that this sweep saw where it saw them."""
