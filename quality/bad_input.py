@@ -22,9 +22,11 @@ PRESETS = ("default", "paper")
 
 MILLION = 1_000_000
 
-FAINT_SUPPORT = 0.375
+FAINT_SUPPORT, LEAST_CLAIM = 0.5, 0.001
 """A box worth acting on holds as many points of the input as a cluster needs. One that scores less may hold
-this share of them: the evidence may shift a box so that it leaves some of its cluster's points outside."""
+this share of them: the evidence may shift a box so that it leaves some of its cluster's points outside. And
+one that scores less than the second claims nothing: its middle may lie so far behind its points that the
+ground there is another."""
 
 Points = tuple[Any, Any]
 """What a caller hands to `PointCloud.from_numpy`: points, and intensities or None."""
@@ -110,7 +112,8 @@ def broken_laws(detections: Detections, xyz: np.ndarray, capacity: int, config: 
 
 def _box_laws(d: Detections, xyz: np.ndarray, config: DetectorConfig) -> dict[str, Any]:
     valid = np.asarray(d.valid)
-    share = np.where(d.score[valid] >= DEFAULT_SCORE_THRESHOLD, 1, FAINT_SUPPORT)
+    score = np.asarray(d.score)[valid]
+    share = np.where(score >= DEFAULT_SCORE_THRESHOLD, 1, np.where(score >= LEAST_CLAIM, FAINT_SUPPORT, 0))
     support = box_support(d, xyz, config) / config.clustering.min_points
     rows = (d.center, d.size, d.yaw, d.score, d.label, d.num_points, d.hulls.num_vertices)
     return {
