@@ -18,6 +18,7 @@ from jaxbox.config import Label, RegionConfig
 from jaxbox.geometry.rigid import rotation_about_z
 
 AnyBox = TypeVar("AnyBox", bound=Box)
+AnyRows = TypeVar("AnyRows", bound="BoxRows[Any]")
 
 MAX_LISTED = 6
 """Boxes that a text lists, the first ones."""

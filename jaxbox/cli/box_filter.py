@@ -4,12 +4,12 @@ import dataclasses
 import math
 import pathlib
 from collections.abc import Sequence
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from jaxbox._box_rows import MIN_CORNERS, BoxRows, in_polygon
+from jaxbox._box_rows import MIN_CORNERS, AnyRows, in_polygon
 from jaxbox._files import InputError, finite_number, read_text
 from jaxbox.types import Label
 
@@ -27,7 +27,6 @@ WithinOption = Annotated[
         "X_MIN,X_MAX,Y_MIN,Y_MAX, as -10,60,-20,20; or a text file of a polygon, x y a line.",
     ),
 ]
-AnyRows = TypeVar("AnyRows", bound=BoxRows[Any])
 _RECTANGLE = 4
 
 

@@ -147,6 +147,7 @@ from jaxbox.reference.surroundings import (
     depth_behind_faces,
     distance_outside,
     is_behind,
+    sensor_outside,
     top_of,
 )
 from jaxbox.reference.tracking import (
@@ -268,6 +269,7 @@ __all__ = [
     "score_boxes",
     "select_clusters",
     "select_points",
+    "sensor_outside",
     "shape_descriptors",
     "size_score",
     "spread_points",

@@ -32,8 +32,9 @@ SENSOR_LEVELS, PLANE_LEVELS = range(-100, 28), range(-13, 11)
 """Levels about the sensor, and about the plane."""
 SHEET_HALF_M, SHEET_REACH, MIN_SHEET_SQUARES = 40.0, 2, 17
 """Sheets are looked for this near, in windows of 5 x 5 squares of which so many are not empty."""
-SHEET_STEP_M = 0.2
-"""Cells of a square that is on a sheet are on it, too, up to this above it."""
+SHEET_STEP_M, SQUARE_TOLERANCE_M = 0.2, 0.1
+"""Cells of a square are on its sheet up to the first above it, and a square on that of its window up to the
+second off it."""
 MIN_PLANE_POINTS = 3
 """A plane has three degrees of freedom."""
 
@@ -339,7 +340,7 @@ def on_sheets(lowest: np.ndarray, config: GroundConfig) -> np.ndarray:
     num, level, rise, rms = planes_through_windows(square)
     sheet = (num >= MIN_SHEET_SQUARES) & (rms < config.sheet_tolerance_m)
     sheet &= rise < config.max_sheet_grade * POOL_CELLS * config.surface_cell_m
-    sheet &= np.abs(square - level) < SHEET_STEP_M / 2
+    sheet &= np.abs(square - level) < SQUARE_TOLERANCE_M
     above = np.kron(np.where(sheet, level, -np.inf), np.ones((POOL_CELLS, POOL_CELLS)))
     found = np.zeros(lowest.shape, bool)
     found[middle, middle] = near < above[: len(near), : len(near)] + SHEET_STEP_M

@@ -21,7 +21,7 @@ from jaxbox.reference.state import (
     Obstacles,
     RayFractions,
 )
-from jaxbox.reference.surroundings import cluster_alone, count_points_around, in_box_frame
+from jaxbox.reference.surroundings import cluster_alone, count_points_around, in_box_frame, sensor_outside
 
 PSEUDO_COUNT = 5
 """Pseudo-count: upper points that are added, with the share of the full score behind the faces."""
@@ -102,7 +102,7 @@ def reach_of_beams(
     """
     if steepest is None:
         return np.inf
-    nearest = np.hypot(*np.maximum(np.abs(in_box_frame(np.zeros(2), box)) - box[2:4] / 2, 0))
+    nearest = np.hypot(*sensor_outside(box))
     return float(steepest * nearest - elevation(np.array([[*box[:2], lowest_z]]))[0])
 
 
@@ -157,8 +157,7 @@ def end_where_seen(
     Returns:
       (5,) the box with the same near end.
     """
-    sensor = in_box_frame(np.zeros(2), box)
-    along, across = np.maximum(np.abs(sensor) - box[2:4] / 2, 0)
+    along, across = sensor_outside(box)
     view = np.arctan2(across, along)
     weight = min(np.tan(min(view, 1.5)) / float(config.end_slope), 1.0)
     weight *= np.interp(around.deepest / usual_m - float(config.end_length), [0, SEEN_RAMP], [0, 1])
@@ -166,9 +165,8 @@ def end_where_seen(
     # Beams that meet the side at that angle, so far away, are so far apart on it.
     spacing_m = beam_angle * np.hypot(along, across) / np.sin(view) if view > 0 else np.inf
     length = box[2] + weight * (around.deepest + min(spacing_m / 2, MAX_END_MARGIN_M) - box[2])
-    near_end = box[:2] + np.sign(sensor[0]) * box[2] / 2 * np.array([np.cos(box[4]), np.sin(box[4])])
-    center = near_end - np.sign(sensor[0]) * length / 2 * np.array([np.cos(box[4]), np.sin(box[4])])
-    return np.array([*center, length, *box[3:]])
+    facing = np.sign(in_box_frame(np.zeros(2), box)[0]) * np.array([np.cos(box[4]), np.sin(box[4])])
+    return np.array([*(box[:2] + facing * (box[2] - length) / 2), length, *box[3:]])
 
 
 def score_box(

@@ -26,11 +26,7 @@ def distance_outside(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
     Returns:
       (n,) m.
     """
-    x, y, length, width, yaw = box
-    dx, dy = xy[:, 0] - x, xy[:, 1] - y
-    along = np.abs(dx * np.cos(yaw) + dy * np.sin(yaw)) - length / 2
-    across = np.abs(-dx * np.sin(yaw) + dy * np.cos(yaw)) - width / 2
-    return np.maximum(along, across)
+    return np.max(np.abs(in_box_frame(xy, box)) - box[2:4] / 2, axis=1)
 
 
 def count_points_around(
@@ -180,6 +176,21 @@ def depth_behind_end(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
     """
     facing = np.sign(in_box_frame(np.zeros(2), box)[0])
     return box[2] / 2 - facing * in_box_frame(xy, box)[:, 0]
+
+
+def sensor_outside(box: np.ndarray) -> np.ndarray:
+    """How far a sensor at the origin is outside a box.
+
+    Args:
+      box: (5,): x, y, length, width in m and yaw in rad.
+
+    Returns:
+      (2,) m: along and across; 0 where it is beside the box.
+
+    >>> sensor_outside(np.array([10.0, 0, 4, 2, 0])).tolist()
+    [8.0, 0.0]
+    """
+    return np.maximum(np.abs(in_box_frame(np.zeros(2), box)) - box[2:4] / 2, 0)
 
 
 def in_box_frame(xy: np.ndarray, box: np.ndarray) -> np.ndarray:

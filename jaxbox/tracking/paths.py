@@ -154,7 +154,11 @@ def _pad(
     length = last - first + 1
     shape = len(ids), int(length.max())
     sweep = first[:, None] + np.minimum(np.arange(shape[1]), length[:, None] - 1)
-    slot, hit, numbers = np.full(shape, FREE), np.zeros(shape, bool), np.zeros((*shape, 12))
+    slot, hit, numbers = (
+        np.full(shape, FREE),
+        np.zeros(shape, bool),
+        np.zeros((*shape, rows.numbers.shape[1])),
+    )
     slot[at], hit[at], numbers[at] = rows.slot, rows.hit, rows.numbers
     return Paths(
         id=ids,

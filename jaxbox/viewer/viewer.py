@@ -10,9 +10,9 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
-from jaxbox._box_rows import BoxRows
+from jaxbox._box_rows import AnyRows
 from jaxbox.config import DetectorConfig
 from jaxbox.config.fields import preset_config, replace_fields
 from jaxbox.io import InputError
@@ -23,7 +23,6 @@ from jaxbox.viewer.frames import Frame
 from jaxbox.viewer.scene import Scene, View, build_scene
 from jaxbox.viewer.session import Session, Shown
 
-AnyRows = TypeVar("AnyRows", bound=BoxRows[Any])
 SWEEPS_PER_S = 10.0
 """Rate of playing to begin with: that of most sensors."""
 TELL_S = 0.3
