@@ -219,16 +219,17 @@ class Case:
         return [(p, complete(p, int(np.argmax(p.curve)), car, self.evidence)) for p in self.proposals]
 
 
-def complete(proposal, angle, prior, evidence, mode="evidence"):
+def complete(proposal, angle, prior, evidence, mode="evidence", in_row=()):
     """The reference's box of a proposal, of its rectangles at some rotations."""
-    rectangles = [
-        reference.Rectangle(
-            proposal.extents[a], a * np.pi / 2 / len(proposal.curve), float(proposal.curve[a])
-        )
-        for a in np.atleast_1d(angle)
-    ]
+    rectangles = [rectangle_of(proposal, a) for a in np.atleast_1d(angle)]
     config = dataclasses.replace(CONFIG.completion, mode=mode)
-    return reference.complete_box(proposal.xy, rectangles, prior, evidence, config)
+    return reference.complete_box(proposal.xy, rectangles, prior, evidence, config, in_row=in_row)
+
+
+def rectangle_of(proposal, angle):
+    """The reference's rectangle of a proposal at the rotation of that number."""
+    turn = angle * np.pi / 2 / len(proposal.curve)
+    return reference.Rectangle(proposal.extents[angle], turn, float(proposal.curve[angle]))
 
 
 @functools.lru_cache

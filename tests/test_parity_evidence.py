@@ -34,7 +34,7 @@ def build_evidence(xyz, height, mask, plane, surface):
 @parity.PerForm
 def weigh_boxes(seen, boxes, count):
     length, width, yaw = boxes[:, 2:].T
-    flat = Boxes(boxes[:, :2], length, width, yaw, boxes[:, 2:4], length)
+    flat = Boxes(boxes[:, :2], length, width, yaw, boxes[:, 2:4], length, length > 0)
     return evidence.weigh_boxes(seen, flat, count, EVIDENCE, num_rays=NUM_RAYS)
 
 
@@ -221,9 +221,18 @@ def test_completed_boxes_are_those_of_the_reference(cases, number):
         # second reading of each, at any rotation.
         angles = [int(np.argmax(p.curve)) if number == 0 else rng.integers(90) for p in case.proposals]
         others = list(rng.integers(90, size=len(angles)))
+        rectangles = [list(map(parity.rectangle_of, case.proposals, each)) for each in (angles, others)]
+        rows = range(len(angles) if number == 0 else 0)
+        in_row = reference.sides_in_rows(rows, rectangles, vehicle, parity.CONFIG.completion)
         expected = [
-            parity.complete(p, pair, vehicle, case.evidence)
-            for p, *pair in zip(case.proposals, angles, others, strict=True)
+            parity.complete(
+                p,
+                pair,
+                vehicle,
+                case.evidence,
+                in_row=[(i, side) for other, i, side in in_row if other == row],
+            )
+            for row, (p, *pair) in enumerate(zip(case.proposals, angles, others, strict=True))
         ]
         points, count = parity.padded_points([case])
         boxes = complete(

@@ -23,6 +23,7 @@ IN_SHORT = {
     "open street: as it is": 10,
     "beside a wall: 0.2 m": 6,
     "beside a hedge: 0.2 m": 6,
+    "rows, side by side: gaps of 0.3 m": 5,
     "very near: middle 3 m away": 15,
     "under a ceiling: 2.3 m": 6,
     "under a ceiling: 3 m": 6,

@@ -299,6 +299,11 @@ class CompletionConfig:
     """Weight of the rectangle criterion."""
     not_away_cost: Scalar = 0.02
     """Cost of a width that does not extend away from the sensor."""
+    row_distance_m: Scalar = 3.0
+    """Of vehicles of the first class that stand side by side, three or more, each hides the sides of the
+    next: only the rays that reach them count. From one to the next it is at most this far,"""
+    row_shift_m: Scalar = 0.7
+    """and one stands at most this much farther forward than the other."""
 
 
 @config_class

@@ -21,7 +21,6 @@ from jaxbox.reference.clustering import (
     select_clusters,
 )
 from jaxbox.reference.completion import (
-    Assignment,
     assign_length_axis,
     choose_placement,
     complete_box,
@@ -38,6 +37,7 @@ from jaxbox.reference.completion import (
     place,
     place_widths,
     point_agreement,
+    sides_in_rows,
 )
 from jaxbox.reference.descriptors import (
     describe,
@@ -107,6 +107,11 @@ from jaxbox.reference.rectangles import (
     try_rotations,
     wrap_yaw,
 )
+from jaxbox.reference.rows import (
+    find_rows,
+    hit_share,
+    visible_end,
+)
 from jaxbox.reference.scoring import (
     asymmetric_gaussian,
     bev_iou,
@@ -123,6 +128,7 @@ from jaxbox.reference.scoring import (
 )
 from jaxbox.reference.state import (
     NO_CLUSTER,
+    Assignment,
     Candidate,
     ClassHypothesis,
     Cluster,
@@ -222,6 +228,7 @@ __all__ = [
     "find_cells",
     "find_clusters",
     "find_fronts",
+    "find_rows",
     "first_returns",
     "fit_ground_plane",
     "fit_ground_planes",
@@ -235,6 +242,7 @@ __all__ = [
     "ground_support",
     "height_above_ground",
     "height_above_planes",
+    "hit_share",
     "index_obstacles",
     "is_behind",
     "is_large",
@@ -271,6 +279,7 @@ __all__ = [
     "select_points",
     "sensor_outside",
     "shape_descriptors",
+    "sides_in_rows",
     "size_score",
     "spread_points",
     "steepest_beam",
@@ -278,6 +287,7 @@ __all__ = [
     "top_of",
     "track_step",
     "try_rotations",
+    "visible_end",
     "weigh_boxes",
     "wrap_yaw",
 ]

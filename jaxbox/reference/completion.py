@@ -1,13 +1,16 @@
 """Correction for occluded vehicles: hypotheses for the sides that are out of sight."""
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, Scalar, VehicleConfig
 from jaxbox.reference.evidence import cast_rays, closed_free_length
+from jaxbox.reference.rows import find_rows, hit_share, visible_end
 from jaxbox.reference.state import (
+    Assignment,
     ClassHypothesis,
     Cluster,
     Completed,
@@ -53,17 +56,52 @@ def complete_boxes(
     Returns:
       The hypotheses and their boxes.
     """
+    listed = list_hypotheses(clusters, candidates[0], config.vehicles)
+    in_row: set[tuple[int, int, int]] = set()
+    if config.completion.mode == "evidence":
+        may_be = [hypothesis.cluster for hypothesis in listed if hypothesis.label == 0]
+        in_row = sides_in_rows(may_be, candidates, config.vehicles.classes[0], config.completion)
     hypotheses, boxes, num_assignments = [], [], 0
-    for hypothesis in list_hypotheses(clusters, candidates[0], config.vehicles):
+    for hypothesis in listed:
         prior = config.vehicles.classes[hypothesis.label]
         rectangles = [each[hypothesis.cluster] for each in candidates]
         if config.completion.mode == "evidence":
             num_assignments += count_assignments(rectangles, prior)
-        box = complete_box(outlines[hypothesis.cluster], rectangles, prior, evidence, config.completion)
+        sides = [(i, side) for row, i, side in in_row if (row, 0) == (hypothesis.cluster, hypothesis.label)]
+        box = complete_box(
+            outlines[hypothesis.cluster], rectangles, prior, evidence, config.completion, in_row=sides
+        )
         if box is not None:
             hypotheses.append(hypothesis)
             boxes.append(box)
     return Completed(hypotheses, boxes, num_assignments)
+
+
+def sides_in_rows(
+    clusters: Sequence[int],
+    candidates: Sequence[Sequence[Rectangle]],
+    prior: ClassPrior,
+    config: CompletionConfig,
+) -> set[tuple[int, int, int]]:
+    """Which sides of rectangles are the lengths of vehicles in a row, see `find_rows`.
+
+    Args:
+      clusters: those that may be of the class.
+      candidates: rectangles of all clusters, one or two lists of them.
+      prior: of the class.
+      config: of the rows.
+
+    Returns:
+      Cluster, list and side of each.
+    """
+    ends = {}
+    for cluster, (i, rectangles), side in itertools.product(clusters, enumerate(candidates), (0, 1)):
+        sides = assign_length_axis(rectangles[cluster], side)
+        end = visible_end(sides, prior) if fits(sides, prior) else None
+        if end is not None:
+            ends[cluster, i, side] = end
+    found = find_rows(np.array(list(ends.values())).reshape(-1, 3), float(prior.width_m), config)
+    return set(itertools.compress(ends, found))
 
 
 def list_hypotheses(
@@ -132,6 +170,8 @@ def complete_box(
     prior: ClassPrior,
     evidence: Evidence | None,
     config: CompletionConfig,
+    *,
+    in_row: Collection[tuple[int, int]] = (),
 ) -> CompletedBox | None:
     """Completes a rectangle round a cluster to the size of a vehicle class.
 
@@ -147,6 +187,7 @@ def complete_box(
       prior: of the class.
       evidence: of the sweep; None only where the mode is another.
       config: the mode and its weights.
+      in_row: the rectangles and sides that are in a row of vehicles, see `find_rows`.
 
     Returns:
       The box, or None where the measured sides are too long for the class.
@@ -156,35 +197,22 @@ def complete_box(
         return keep_measured(sides, prior) if config.mode == "none" else extend_away(sides, prior, config)
     assert evidence is not None
     best: CompletedBox | None = None
-    for rectangle in rectangles:
-        for sides in (assign_length_axis(rectangle, side) for side in (0, 1)):
+    for i, rectangle in enumerate(rectangles):
+        for side in (0, 1):
+            sides = assign_length_axis(rectangle, side)
             if not fits(sides, prior):
                 continue
+            between = (i, side) in in_row
             boxes = place_widths(sides, prior)
             rays = cast_rays(evidence, boxes, num_rays=config.num_rays)
-            rays = dataclasses.replace(rays, free_length=closed_free_length(rays, prior))
+            free_length, hit = closed_free_length(rays, prior), hit_share(rays, between)
+            rays = dataclasses.replace(rays, hit=hit, free_length=free_length)
             agreement = point_agreement(boxes, xy, config)
             placement, objective = choose_placement(rectangle.score, agreement, rays, config)
             if best is None or objective > best.objective:
-                best = place(sides, likely_sizes(sides, prior, config), placement, objective)
+                box = place(sides, likely_sizes(sides, prior, config), placement, objective)
+                best = dataclasses.replace(box, in_row=between)
     return best
-
-
-@dataclasses.dataclass(frozen=True)
-class Assignment:
-    """A rectangle with one of its sides taken as the length."""
-
-    along: tuple[float, float]
-    """m: where the length begins and ends, along the box and from the sensor."""
-    across: tuple[float, float]
-    """m: the same of the width, across the box."""
-    yaw: float
-    """rad, not wrapped."""
-
-    @property
-    def measured(self) -> tuple[float, float]:
-        """m: length and width."""
-        return self.along[1] - self.along[0], self.across[1] - self.across[0]
 
 
 def assign_length_axis(rectangle: Rectangle, side: int) -> Assignment:

@@ -10,6 +10,7 @@ from scipy.special import expit
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, Scalar, VehicleConfig
 from jaxbox.reference.completion import SEEN_RAMP
 from jaxbox.reference.evidence import GroundElevation, closed_free_length
+from jaxbox.reference.rows import hit_share
 from jaxbox.reference.state import (
     Candidate,
     ClassHypothesis,
@@ -54,12 +55,14 @@ def score_boxes(
       What scores more than the least score, best first.
     """
 
+    in_row = np.array([box.in_row for box in completed.boxes], bool)
+
     def judge(row: int, hypothesis: ClassHypothesis, box: CompletedBox) -> Candidate:
         cluster, prior = clusters[hypothesis.cluster], config.vehicles.classes[hypothesis.label]
         hit, free_length, support = 1.0, 0.0, None
         if rays is not None:
             free = closed_free_length(rays[0], prior)
-            hit, free_length, support = (float(a[row]) for a in (rays[0].hit, free, rays[1]))
+            hit, free_length, support = (float(a[row]) for a in (hit_share(rays[0], in_row), free, rays[1]))
         early = early_score(
             box,
             prior,
@@ -70,7 +73,8 @@ def score_boxes(
             config=config.vehicles,
         )
         around = _look_around(box.box, prior, cluster, early, obstacles, config.vehicles)
-        if config.vehicles.neighbourhood and config.completion.mode != "none":
+        ends_seen = config.vehicles.neighbourhood and config.completion.mode != "none"
+        if ends_seen and not box.in_row:
             beam_angle = 2 * np.pi / config.evidence.num_azimuths
             seen = end_where_seen(box.box, around, float(prior.length_m), config.completion, beam_angle)
             box = dataclasses.replace(box, box=seen)

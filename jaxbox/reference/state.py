@@ -145,6 +145,23 @@ class RayFractions:
 
 
 @dataclasses.dataclass(frozen=True)
+class Assignment:
+    """A rectangle with one of its sides taken as the length."""
+
+    along: tuple[float, float]
+    """m: where the length begins and ends, along the box and from the sensor."""
+    across: tuple[float, float]
+    """m: the same of the width, across the box."""
+    yaw: float
+    """rad, not wrapped."""
+
+    @property
+    def measured(self) -> tuple[float, float]:
+        """m: length and width."""
+        return self.along[1] - self.along[0], self.across[1] - self.across[0]
+
+
+@dataclasses.dataclass(frozen=True)
 class CompletedBox:
     """A rectangle in the bird's-eye view, its hidden sides completed."""
 
@@ -156,6 +173,8 @@ class CompletedBox:
     """Extent of the fitted points along the box."""
     measured_width_m: float
     """Extent of the fitted points across the box."""
+    in_row: bool = False
+    """Whether it stands side by side with others, which hide its sides."""
 
 
 @dataclasses.dataclass(frozen=True)

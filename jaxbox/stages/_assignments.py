@@ -181,4 +181,5 @@ def place(
         yaw=sides.yaw,
         measured=jnp.stack(sides.measured, axis=-1),
         objective=objective,
+        in_row=jnp.zeros_like(objective, bool),
     )

@@ -24,6 +24,7 @@ from jaxbox.stages._assignments import (
     place,
 )
 from jaxbox.stages._priors import closed_free_length, prior_of
+from jaxbox.stages._rows import find_rows, hit_share, visible_ends
 from jaxbox.stages.state import (
     NOT_A_BOX,
     Boxes,
@@ -168,19 +169,17 @@ def _complete_by_evidence(
 
     And how many assignments the evidence had to weigh.
     """
-    placement, objective, num = _judge_assignments(hypotheses, candidates, points, cast_rays, config)
+    *judged, num = _judge_assignments(hypotheses, candidates, points, cast_rays, config)
 
     def complete(of_hypothesis: tuple[jax.Array, ...]) -> Boxes:
-        cluster, label, placement, objective = of_hypothesis
-        best = jax.lax.argmax(objective, 1, jnp.int32)
-        placement, objective = (
-            jnp.take_along_axis(a, best[:, None], axis=1)[:, 0] for a in (placement, objective)
-        )
+        cluster, label, *judged = of_hypothesis
+        best = jax.lax.argmax(judged[1], 1, jnp.int32)
+        placement, objective, in_row = (jnp.take_along_axis(a, best[:, None], axis=1)[:, 0] for a in judged)
         sides = _assign(candidates, best, cluster)
         sizes = likely_sizes(sides, prior_of(config.vehicles.classes, label), config.completion)
-        return place(sides, sizes, placement, objective)
+        return dataclasses.replace(place(sides, sizes, placement, objective), in_row=in_row)
 
-    rows = hypotheses.cluster, hypotheses.label, placement, objective
+    rows = hypotheses.cluster, hypotheses.label, *judged
     return map_rows(complete, rows, num_rows=hypotheses.num), num
 
 
@@ -199,23 +198,27 @@ def _judge_assignments(
     points: PointLists,
     cast_rays: CastRays,
     config: DetectorConfig,
-) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """The best placement of each assignment of each hypothesis, and its J: (Q, W) each; their number."""
+) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """The best placement of each assignment of each hypothesis, its J, and whether it is in a row: (Q, W)
+    each; their number.
+    """
     num_each = NUM_ASSIGNMENTS * len(candidates)
     entry, num = _largest_first(hypotheses, candidates, points, config.vehicles)
     num_entries, entry = entry.shape[0], entry[: config.completion.max_assignments]
 
-    def prepare(entry: jax.Array) -> tuple[Placements, jax.Array, jax.Array, jax.Array]:
+    def prepare(entry: jax.Array) -> tuple[Any, ...]:
         hypothesis, number = split_index(entry, num_each)
         cluster, label = take(hypotheses.cluster, hypothesis), take(hypotheses.label, hypothesis)
         sides = _assign(candidates, number, cluster)
-        return place_widths(sides, prior_of(config.vehicles.classes, label)), sides.score, cluster, label
+        prior = prior_of(config.vehicles.classes, label)
+        ends, may_be = visible_ends(sides, prior)
+        return ends, may_be & (label == 0), (place_widths(sides, prior), sides.score, cluster, label)
 
-    def judge(rows: tuple[Placements, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        boxes, score, cluster, label = rows
+    def judge(rows: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
+        (boxes, score, cluster, label), in_row = rows
         rays = cast_rays(boxes, num_rays=config.completion.num_rays)
         closed = closed_free_length(rays, prior_of(config.vehicles.classes, label))
-        rays = dataclasses.replace(rays, free_length=closed)
+        rays = dataclasses.replace(rays, hit=hit_share(rays, in_row), free_length=closed)
         agreement = point_agreement(boxes, *points.table(cluster), config.completion)
         return choose_placement(score, agreement, rays, config.completion)
 
@@ -223,12 +226,19 @@ def _judge_assignments(
         entry, *found = rows
         return tuple(a.at[entry].set(value, mode="drop") for a, value in zip(tables, found, strict=True))
 
-    prepared = map_rows(prepare, entry, num_rows=num)
-    judged = map_rows(judge, prepared, num_rows=num, chunk=chunks.PROPOSALS)
-    nothing = jnp.zeros(num_entries, jnp.int32), jnp.full(num_entries, NOT_A_BOX, jnp.float32)
-    of_entry = fold_rows(note, nothing, (entry, *judged), num_rows=num, absent=(num_entries, 0, 0.0))
-    placement, objective = (a.reshape(-1, num_each) for a in of_entry)
-    return placement, objective, num
+    ends, may_be, prepared = map_rows(prepare, entry, num_rows=num)
+    may_be = may_be & (jnp.arange(may_be.shape[0], dtype=jnp.int32) < num)
+    in_row = find_rows(ends, may_be, config.vehicles.classes[0].width_m, config.completion)
+    judged = map_rows(judge, (prepared, in_row), num_rows=num, chunk=chunks.PROPOSALS)
+    nothing = (
+        jnp.zeros(num_entries, jnp.int32),
+        jnp.full(num_entries, NOT_A_BOX, jnp.float32),
+        jnp.zeros(num_entries, bool),
+    )
+    rows, absent = (entry, *judged, in_row), (num_entries, 0, 0.0, False)
+    of_entry = fold_rows(note, nothing, rows, num_rows=num, absent=absent)
+    placement, objective, in_row = (a.reshape(-1, num_each) for a in of_entry)
+    return placement, objective, in_row, num
 
 
 def _largest_first(

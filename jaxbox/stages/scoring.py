@@ -12,6 +12,7 @@ from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, VehicleC
 from jaxbox.geometry.planar import rectangle_iou, wrap_yaw
 from jaxbox.stages._assignments import SEEN_RAMP
 from jaxbox.stages._priors import asymmetric_gaussian, closed_free_length, prior_of, size_score
+from jaxbox.stages._rows import hit_share
 from jaxbox.stages._surroundings import cluster_alone, count_points_around, sensor_from
 from jaxbox.stages.state import (
     NOT_A_BOX,
@@ -84,16 +85,17 @@ def score_boxes(
         size = jnp.stack([box.length, box.width, wrap_yaw(box.yaw)], axis=1)
         rectangle = jnp.concatenate([box.center, size], axis=1)
         of_hypothesis = take(hypotheses.label, chosen), take(hypotheses.cluster, chosen)
-        return rectangle, *of_hypothesis, take(score, chosen), box.measured[:, 1]
+        return rectangle, *of_hypothesis, take(score, chosen), box.measured[:, 1], box.in_row
 
     picked = map_rows(pick, chosen, num_rows=num)
-    rectangle, label, cluster, early, _ = picked
+    rectangle, label, cluster, early, *_ = picked
     around = _look_around(rectangle, label, cluster, early, num, clusters, obstacles, config)
 
     def finish(rows: tuple[Any, ...]) -> Candidates:
-        rectangle, label, cluster, *others, around = rows
+        rectangle, label, cluster, *others, in_row, around = rows
         if config.vehicles.neighbourhood and config.completion.mode != "none":
-            rectangle = _end_where_seen(rectangle, label, around, config)
+            ended = _end_where_seen(rectangle, label, around, config)
+            rectangle = jnp.where(in_row[:, None], rectangle, ended)
         z = jnp.zeros_like(rectangle[:, 0]) if lowest_z is None else take(lowest_z, cluster)
         ground = ground_elevation(jnp.concatenate([rectangle[:, :2], z[:, None]], axis=1))
         nearest = jnp.hypot(*_distances_outside(rectangle))
@@ -122,7 +124,8 @@ def _early_scores(
         ones = jnp.ones_like(boxes.yaw)
         hit, free_length, support = ones, 0 * ones, config.support_points * ones
         if rays is not None:
-            hit, free_length, support = rays[0].hit, closed_free_length(rays[0], prior), rays[1]
+            hit, free_length = hit_share(rays[0], boxes.in_row), closed_free_length(rays[0], prior)
+            support = rays[1]
         num_points = take(clusters.num_points, cluster)
         by_evidence = evidence_score(num_points, hit, free_length, support, boxes.objective, config)
         by_size = size_score(boxes.length, boxes.width, prior)

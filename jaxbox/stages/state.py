@@ -268,6 +268,8 @@ class Boxes:
     """(..., 2) float32, m: length and width before completion."""
     objective: jax.Array
     """(...) float32: J, how well the box explains the evidence; NOT_A_BOX where no hypothesis fits."""
+    in_row: jax.Array
+    """(...) bool: whether it stands side by side with others, which hide its sides."""
 
 
 @jax.tree_util.register_dataclass

@@ -54,6 +54,9 @@ RUN_ROWS = 32
 RUN_BLOCKS, RUN_BLOCKS_ON_ACCELERATOR = 1024, 8192
 """Such blocks looked at in one go."""
 
+PAIRS = 64
+"""Rows compared with as many others at a time."""
+
 RANKS = 16
 """Rows that all others are compared with in one step."""
 

@@ -1,0 +1,52 @@
+"""What rows are to each other, at a fixed shape."""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from jaxbox.xla import chunks
+from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.loops import for_chunks, whole_chunks
+
+Relation = Callable[[jax.Array, jax.Array], jax.Array]
+"""What one row is to another, () uint32: flags."""
+
+
+def join_pairs(rows: jax.Array, num_rows: jax.Array, relation: Relation) -> jax.Array:
+    """What each row is to any other. Law: word i has the bits of all ``relation(rows[i], rows[j])``.
+
+    Args:
+      rows: (P, ...).
+      num_rows: () int32, how many rows count.
+      relation: of two rows, or of a row to itself.
+
+    Returns:
+      (P,) uint32; 0 for rows that do not count.
+    """
+    if on_accelerator():
+        valid = jnp.arange(rows.shape[0], dtype=jnp.int32) < num_rows
+        return _join(relation, rows, rows, valid[:, None] & valid[None])
+    capacity, chunk = rows.shape[0], chunks.PAIRS
+    rows = whole_chunks(rows, chunk)
+    row, num = jnp.arange(chunk, dtype=jnp.uint32), jnp.uint32(num_rows)
+
+    def add(i: jax.Array, j: jax.Array, words: jax.Array) -> jax.Array:
+        first, second = (jax.lax.dynamic_slice_in_dim(rows, k, chunk) for k in (i, j))
+        new = _join(relation, first, second, (i + row[:, None] < num) & (j + row[None] < num))
+        before = jax.lax.dynamic_slice_in_dim(words, i, chunk)
+        return jax.lax.dynamic_update_slice(words, before | new, (i,))
+
+    def add_row(i: jax.Array, words: jax.Array) -> jax.Array:
+        return for_chunks(num_rows, chunk, functools.partial(add, i), words)
+
+    words = for_chunks(num_rows, chunk, add_row, jnp.zeros(rows.shape[0], jnp.uint32), capacity=capacity)
+    return words[:capacity]
+
+
+def _join(relation: Relation, first: jax.Array, second: jax.Array, counts: jax.Array) -> jax.Array:
+    # Reductions along the first axis vectorise on a CPU.
+    each = jax.vmap(jax.vmap(relation, (0, None)), (None, 0))(first, second)
+    each = jnp.where(counts.T, each, jnp.uint32(0))
+    return jax.lax.reduce(each, jnp.uint32(0), jax.lax.bitwise_or, (0,))
