@@ -104,9 +104,9 @@ def score_boxes(columns, prior):
     seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "objective"))
     where = (columns[name] for name in ("rho", "reach", "seen_width"))
     early = scoring.evidence_score(*seen, SETTINGS)
-    late, is_cut = scoring.neighbourhood_score(around, *where, prior, SETTINGS)
+    late, top_unseen = scoring.neighbourhood_score(around, *where, prior, SETTINGS)
     by_size = scoring.size_score(columns["length"], columns["width"], prior)
-    return early * by_size * late * prior.prior_weight, is_cut
+    return early * by_size * late * prior.prior_weight, top_unseen
 
 
 @jax.jit
@@ -141,8 +141,8 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
         ],
     }
     columns, prior = jax.tree.map(np.float32, (columns, prior))
-    scores, is_cut = jax.device_get(score_boxes(columns, prior))
-    expected, expected_cut = [], []
+    scores, top_unseen = jax.device_get(score_boxes(columns, prior))
+    expected, expected_unseen = [], []
     for row in range(MAX_BOXES):
         around = reference.NeighbourhoodCounts(*(float(value[row]) for value in columns["around"]))
         one = {name: float(columns[name][row]) for name in ("hit", "free_length", "support")}
@@ -161,13 +161,13 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
         )
         where = (float(columns[name][row]) for name in ("rho", "reach", "seen_width"))
         late = reference.neighbourhood_score(around, *where, SETTINGS.classes[label[row]], SETTINGS)
-        expected_cut.append(late[1])
+        expected_unseen.append(late[1])
     expected = np.array(expected)
     np.testing.assert_allclose(scores, expected, rtol=2e-4, atol=1e-7)
     assert (expected == 0).sum() > 50
     assert (expected > 0.05).sum() > 50
-    np.testing.assert_array_equal(is_cut, expected_cut)
-    assert 20 < sum(expected_cut) < MAX_BOXES - 20
+    np.testing.assert_array_equal(top_unseen, expected_unseen)
+    assert 20 < sum(expected_unseen) < MAX_BOXES - 20
 
 
 def test_free_space_below_a_body_counts_as_in_the_reference():

@@ -905,6 +905,16 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     assert score(around=low, reach=1.31) == score(around=low)
     assert score(around=dataclasses.replace(low, top=0.39), reach=0.39) == 0
     assert score(reach=1.5) == 1
+    # Far away a bumper may be all that returns, if it is as wide as the class.
+    bumper = dataclasses.replace(around, top=0.6)
+    assert score(moved(PERFECT_BOX, x=20), around=bumper) == pytest.approx(0.7)
+    assert score(moved(PERFECT_BOX, x=15), around=bumper) == pytest.approx(0.35)
+    assert score(moved(PERFECT_BOX, x=10), around=bumper) == 0
+    narrow = (3.9, 0.7 * 1.63)
+    assert score(moved(PERFECT_BOX, x=30), around=bumper, measured=narrow) == pytest.approx(0.35)
+    assert score(moved(PERFECT_BOX, x=30), around=dataclasses.replace(around, top=0.39)) == 0
+    as_vans = dataclasses.replace(CAR, min_bumper_m=10.0)
+    assert score(moved(PERFECT_BOX, x=30), around=bumper, prior=as_vans) == 0
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,9 @@ class ClassPrior:
     """Lower tops, after the range allowance, are not such a vehicle."""
     min_cut_height_m: Scalar
     """The same where the highest beam cuts the top off."""
+    min_bumper_m: Scalar
+    """The same where nothing returns from above a bumper; more than any height for classes that are not told
+    so."""
     max_height_m: Scalar
     """Higher tops are not such a vehicle."""
     max_length_m: Scalar
@@ -153,6 +156,7 @@ class Label(enum.IntEnum):
         height_above_m=0.6,
         min_height_m=1.0,
         min_cut_height_m=0.4,
+        min_bumper_m=0.4,
         max_height_m=2.3,
         max_length_m=6.5,
         max_width_m=2.4,
@@ -174,6 +178,7 @@ class Label(enum.IntEnum):
         height_above_m=0.35,
         min_height_m=2.2,
         min_cut_height_m=2.2,
+        min_bumper_m=10.0,
         max_height_m=2.7,
         max_length_m=7.5,
         max_width_m=2.6,
@@ -195,6 +200,7 @@ class Label(enum.IntEnum):
         height_above_m=0.8,
         min_height_m=2.4,
         min_cut_height_m=1.8,
+        min_bumper_m=10.0,
         max_height_m=4.2,
         max_length_m=18.0,
         max_width_m=3.2,

@@ -351,10 +351,13 @@ class VehicleConfig:
     """score x exp(-weight x ring points / points)."""
     overhead_weight: Scalar = 6.0
     """score x exp(-weight x points above / points), where those above are connected to the vehicle."""
-    cut_score: Scalar = 0.7
-    """Score of the height where the highest beam cuts a vehicle off below its usual height, so that the
-    height is not known, and the class's is answered; less where less than half of the class's width was
-    measured. 0 takes the top of the points for that of the vehicle."""
+    unseen_top_score: Scalar = 0.7
+    """Score of the height where the top is out of sight, so that the class's height is answered: where the
+    highest beam cuts a vehicle off, less where less than half of the class's width was measured; and where
+    far vehicles return from a bumper alone. 0 takes the top of the points for that of the vehicle."""
+    bumper_from_m: Scalar = 20.0
+    """Range from which glass and slanted panels may return nothing, in full 10 m farther; where nearly the
+    class's width was measured."""
     overhead_gap_m: Scalar = 0.25
     """They are connected where the gap between its top and the height from which points are above is at most
     this, and are not where it is twice this: a ceiling or a crown is no part of what stands under it."""

@@ -196,7 +196,7 @@ def _standing(winner: Candidate, cluster: Cluster, config: VehicleConfig) -> tup
     if not config.neighbourhood:
         return cluster.bottom_m, cluster.top_m - cluster.bottom_m
     prior = config.classes[winner.hypothesis.label]
-    least = max(prior.min_box_height_m, prior.height_m if winner.is_cut else 0.0)
+    least = max(prior.min_box_height_m, prior.height_m if winner.top_unseen else 0.0)
     return 0.0, float(max(winner.around.top + config.top_margin_m, least))
 
 

@@ -28,6 +28,9 @@ PSEUDO_COUNT = 5
 """Pseudo-count: upper points that are added, with the share of the full score behind the faces."""
 CUT_SLACK_M = 0.1
 """Tops from so much below the highest beam on are more and more taken to be cut off by it."""
+BUMPER_RAMP_M, BUMPER_WIDTHS = 10.0, (0.6, 0.8)
+"""A far box may be a bumper alone: the more the farther over so much range, and the wider between these
+shares of the class's width."""
 MAX_END_MARGIN_M = 0.4
 """An end lies no farther beyond the last point than this."""
 
@@ -81,8 +84,8 @@ def score_boxes(
         rho = float(np.hypot(box.box[0], box.box[1]))
         lowest_z = obstacles.xyz[cluster.members, 2].min() if config.ground.max_planes > 1 else 0.0
         where = rho, reach(box.box, lowest_z), box.measured_width_m
-        late, is_cut = neighbourhood_score(around, *where, prior, config.vehicles)
-        return Candidate(hypothesis, box, around, is_cut, early * late)
+        late, top_unseen = neighbourhood_score(around, *where, prior, config.vehicles)
+        return Candidate(hypothesis, box, around, top_unseen, early * late)
 
     pairs = zip(completed.hypotheses, completed.boxes, strict=True)
     candidates = [judge(row, *pair) for row, pair in enumerate(pairs)]
@@ -295,26 +298,28 @@ def neighbourhood_score(
       around: see `count_points_around`.
       rho: m, range of the box: it may be higher than its top by `top_grade` times this.
       reach: m above the ground: where the box begins, the highest beam passes there, and cuts off what is
-        higher. A top that comes near to it may lie anywhere above, for `cut_score` of the score.
-      seen_width_m: m, measured: that share of it falls with the width below half the class's.
+        higher. A top that comes near to it may lie anywhere above, for `unseen_top_score` of the score; so
+        may that of a vehicle of which only a bumper returns, beyond `bumper_from_m`.
+      seen_width_m: m, measured: the first falls with the width below half the class's, a bumper is as wide as
+        the class.
       prior: of the class.
       config: exp(-(ring weight x ring + overhead weight x above) / inside), and a factor from
         `upright_score`, where no upper point is recessed, to 1 from the share `recess_share` on. Points above
         do not count where the top is twice `overhead_gap_m` below `count_max_height_m`.
 
     Returns:
-      In [0, 1], 0 where a gate of the class closes; and whether it is that of a box that is cut off.
+      In [0, 1], 0 where a gate of the class closes; and whether it is that of a box whose top is out of
+      sight.
     """
     highest = around.top + config.top_grade * rho
     widths = prior.height_m, prior.height_below_m, prior.height_above_m
-    seen = cut = 0.0
+    seen = unseen = 0.0
     if prior.min_height_m < highest and around.top < prior.max_height_m:
         seen = asymmetric_gaussian(min(max(prior.height_m, around.top), highest), *widths)
-    if prior.min_cut_height_m < around.top < prior.max_height_m:
-        share = min(max(1 + (around.top - reach) / CUT_SLACK_M, 0.0), 1.0)
-        share *= min(2 * seen_width_m / prior.width_m, 1.0)
-        cut = float(config.cut_score * share) * asymmetric_gaussian(max(prior.height_m, around.top), *widths)
-    score = max(seen, cut)
+    if around.top < prior.max_height_m:
+        unseen = _share_unseen(around.top, rho, reach, seen_width_m, prior, config)
+        unseen *= asymmetric_gaussian(max(prior.height_m, around.top), *widths)
+    score = max(seen, unseen)
     gap = prior.count_max_height_m - highest
     connected = min(max(2 - gap / config.overhead_gap_m, 0.0), 1.0)
     clutter = config.ring_weight * around.num_ring + config.overhead_weight * connected * around.num_above
@@ -322,7 +327,21 @@ def neighbourhood_score(
     share = around.num_recessed + PSEUDO_COUNT * config.recess_share
     share = share / (around.num_upper + PSEUDO_COUNT)
     upright = config.upright_score + (1 - config.upright_score) * min(1.0, share / config.recess_share)
-    return float(score * upright), cut > seen
+    return float(score * upright), unseen > seen
+
+
+def _share_unseen(
+    top: float, rho: float, reach: float, seen_width_m: float, prior: ClassPrior, config: VehicleConfig
+) -> float:
+    """What the class's height counts where the top is out of sight: above the highest beam or a bumper."""
+    share = seen_width_m / float(prior.width_m)
+    cut = bumper = 0.0
+    if top > prior.min_cut_height_m:
+        cut = np.interp(top - reach, [-CUT_SLACK_M, 0], [0, 1]) * min(2 * share, 1.0)
+    if top > prior.min_bumper_m:
+        bumper = np.interp(rho - float(config.bumper_from_m), [0, BUMPER_RAMP_M], [0, 1])
+        bumper *= np.interp(share, BUMPER_WIDTHS, [0, 1])
+    return float(config.unseen_top_score * max(cut, bumper))
 
 
 def bev_iou(first: np.ndarray, second: np.ndarray) -> float:

@@ -230,8 +230,8 @@ class Candidate:
     """The box."""
     around: NeighbourhoodCounts
     """Points in and round it."""
-    is_cut: bool
-    """Whether its top is out of sight, above the highest beam."""
+    top_unseen: bool
+    """Whether its top is out of sight: above the highest beam, or above a bumper."""
     score: float
     """In [0, 1]."""
 

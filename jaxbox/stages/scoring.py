@@ -41,6 +41,11 @@ CUT_SLACK_M, NOT_CUT_M = 0.1, 1e6
 passes when nothing is known of it."""
 
 
+BUMPER_RAMP_M, BUMPER_WIDTHS = 10.0, (0.6, 0.8)
+"""What is seen of a far vehicle is more and more often a bumper alone: over so much range; and between these
+fractions of the class's width it is believed to be one."""
+
+
 INSIDE_TOLERANCE_M = 1e-3
 """A point on the face of its box is inside."""
 
@@ -178,9 +183,9 @@ def _finish(rows: tuple[Any, ...], reach: jax.Array, clusters: Clusters, config:
     rectangle, label, cluster, score, seen_width_m, around = rows
     prior = prior_of(config.classes, label)
     rho = jnp.linalg.norm(rectangle[:, :2], axis=1)
-    late, is_cut = neighbourhood_score(around, rho, reach, seen_width_m, prior, config)
+    late, top_unseen = neighbourhood_score(around, rho, reach, seen_width_m, prior, config)
     height = jnp.maximum(around.top + config.top_margin_m, prior.min_box_height_m)
-    height = jnp.where(is_cut, jnp.maximum(height, prior.height_m), height)
+    height = jnp.where(top_unseen, jnp.maximum(height, prior.height_m), height)
     bottom = jnp.zeros_like(height)
     if not config.neighbourhood:
         # The paper keeps the height of the cluster itself.
@@ -300,8 +305,9 @@ def neighbourhood_score(
     """The part of the score that the points in and round the box decide.
 
     The true top lies between the top of the points and that plus the beams' spacing; it is compared with the
-    class at the place in between that suits it best. Where the highest beam cuts the box off, it may lie
-    anywhere above: then the height says nothing, and counts less.
+    class at the place in between that suits it best. Where the highest beam cuts the box off, or where far
+    vehicles return from a bumper alone, it may lie anywhere above: then the height says nothing, and counts
+    less.
 
     Args:
       around: see `count_points_around`.
@@ -316,40 +322,51 @@ def neighbourhood_score(
 
     Returns:
       score: (P,) float32 in [0, 1]; 0 where a gate fails.
-      is_cut: (P,) bool, whether it is that of a box that the highest beam cuts off.
+      top_unseen: (P,) bool, whether it is that of a box whose top is out of sight.
     """
     highest = around.top + config.top_grade * rho
     clearance = prior.count_max_height_m - highest
     connected = jnp.clip(2 - clearance / config.overhead_gap_m, 0, 1)
     overhead = config.overhead_weight * connected * around.num_above
     clutter = (config.ring_weight * around.num_ring + overhead) / jnp.maximum(around.num_inside, 1)
-    score, is_cut = _height_score(around.top, highest, reach, seen_width_m, prior, config)
+    unseen = _unseen_top_score(around.top, rho, reach, seen_width_m / prior.width_m, prior, config)
+    seen = _height_score(around.top, highest, prior)
+    score, top_unseen = jnp.maximum(seen, unseen), unseen > seen
     score = score * jnp.exp(-clutter)
     recessed = around.num_recessed + PSEUDO_COUNT * config.recess_share
     recessed = recessed / (around.num_upper + PSEUDO_COUNT)
     upright = config.upright_score + (1 - config.upright_score) * jnp.minimum(
         recessed / config.recess_share, 1
     )
-    return score * upright, is_cut
+    return score * upright, top_unseen
 
 
-def _height_score(
+def _height_score(top: jax.Array, highest: jax.Array, prior: ClassPrior) -> jax.Array:
+    """(P,) how well tops suit the class, as high as they may be."""
+    widths = prior.height_below_m, prior.height_above_m
+    score = asymmetric_gaussian(jnp.clip(prior.height_m, top, highest), prior.height_m, *widths)
+    return jnp.where((highest > prior.min_height_m) & (top < prior.max_height_m), score, 0)
+
+
+def _unseen_top_score(
     top: jax.Array,
-    highest: jax.Array,
+    rho: jax.Array,
     reach: jax.Array,
-    seen_width_m: jax.Array,
+    seen_width: jax.Array,
     prior: ClassPrior,
     config: VehicleConfig,
-) -> tuple[jax.Array, jax.Array]:
-    """(P,) how well tops suit the class, and whether that is as the highest beam cuts the boxes off."""
-    widths = prior.height_below_m, prior.height_above_m
-    seen = asymmetric_gaussian(jnp.clip(prior.height_m, top, highest), prior.height_m, *widths)
-    seen = jnp.where(highest > prior.min_height_m, seen, 0)
-    cut = config.cut_score * jnp.clip(1 + (top - reach) / CUT_SLACK_M, 0, 1)
-    cut = cut * asymmetric_gaussian(jnp.maximum(prior.height_m, top), prior.height_m, *widths)
-    cut = cut * jnp.clip(2 * seen_width_m / prior.width_m, 0, 1)
+) -> jax.Array:
+    """(P,) the same where the top is out of sight; `seen_width` is a fraction of the class's."""
+    cut = jnp.clip(1 + (top - reach) / CUT_SLACK_M, 0, 1) * jnp.clip(2 * seen_width, 0, 1)
     cut = jnp.where(top > prior.min_cut_height_m, cut, 0)
-    return jnp.where(top < prior.max_height_m, jnp.maximum(seen, cut), 0), cut > seen
+    narrow, wide = BUMPER_WIDTHS
+    bumper = jnp.clip((rho - config.bumper_from_m) / BUMPER_RAMP_M, 0, 1)
+    bumper = bumper * jnp.clip((seen_width - narrow) / (wide - narrow), 0, 1)
+    bumper = jnp.where(top > prior.min_bumper_m, bumper, 0)
+    widths = prior.height_below_m, prior.height_above_m
+    score = asymmetric_gaussian(jnp.maximum(prior.height_m, top), prior.height_m, *widths)
+    score = config.unseen_top_score * jnp.maximum(cut, bumper) * score
+    return jnp.where(top < prior.max_height_m, score, 0)
 
 
 def non_max_suppression(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | float) -> jax.Array:
