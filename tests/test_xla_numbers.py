@@ -1,10 +1,13 @@
 """Laws of arithmetic, packed bits, hashing, least squares and grids, against NumPy."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import parity
 import pytest
+from scipy import ndimage
 
 from jaxbox.xla import arithmetic, bits, chunks, grids, hashing, least_squares
 
@@ -181,6 +184,39 @@ def test_map_cells_looks_up_a_function_of_each_points_cell(num_cells, num_points
     columns = function(cell, sums)
     assert len(columns) == 3
     np.testing.assert_array_equal(np.stack(columns, axis=1), table[cell, :3])
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("shape", [(1, 1), (1, 4), (5, 3), (4, 16)])
+@pytest.mark.parametrize(("num_levels", "num_above"), [(1, 0), (3, 2)])
+@pytest.mark.parametrize("num_points", [0, 1, 400])
+def test_window_counts_are_of_the_nine_cells_round_each(shape, num_levels, num_above, num_points):
+    rng = np.random.default_rng(num_points)
+    level, row, column = (rng.integers(0, size, num_points, np.int32) for size in (num_levels, *shape))
+    valid = rng.random(num_points) < 0.8
+
+    @jax.jit
+    def count(level, row, column, valid):
+        cell = grids.margin_cells(row, column, shape)
+        levels = {"num_levels": num_levels, "num_above": num_above}
+        return cell, grids.window_counts(level, cell, valid, shape=shape, **levels)
+
+    cell, counts = count(level, row, column, valid)
+    np.testing.assert_array_equal(cell, row * (shape[1] + 1) + column)
+    expected = np.zeros((num_levels + num_above, *shape))
+    np.add.at(expected, (level[valid], row[valid], column[valid]), 1)
+    expected = ndimage.convolve(expected, np.ones((1, 3, 3)), mode="constant")
+    assert counts.shape[0] == num_levels + num_above
+    inside = np.arange(shape[0])[:, None] * (shape[1] + 1) + np.arange(shape[1])
+    np.testing.assert_array_equal(counts[:, inside], expected)
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("times", [1, 2, 3])
+def test_enlarged_cells_are_squares_of_each(times):
+    grid = np.arange(15, dtype=np.float32).reshape(3, 5)
+    larger = jax.jit(functools.partial(grids.enlarge_cells, times=times))(grid)
+    np.testing.assert_array_equal(larger, np.kron(grid, np.ones((times, times))))
 
 
 @pytest.mark.usefixtures("platform")

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from jaxbox.config import GroundConfig
 from jaxbox.stages._grids import moment_of_neighbours
+from jaxbox.xla.grids import enlarge_cells
 
 SHEET_HALF_M, SHEET_REACH, MIN_SHEET_SQUARES = 40.0, 2, 17
 """Sheets are looked for this near, in windows of 5 x 5 squares of which so many are not empty."""
@@ -50,7 +51,7 @@ def on_sheets(lowest: jax.Array, config: GroundConfig) -> jax.Array:
     is_sheet = (num >= MIN_SHEET_SQUARES) & (rms < config.sheet_tolerance_m)
     is_sheet = is_sheet & (rise < config.max_sheet_grade * SQUARE_CELLS * config.surface_cell_m)
     is_sheet = is_sheet & (jnp.abs(square - level) < SQUARE_TOLERANCE_M)
-    level = jnp.where(is_sheet, level, -jnp.inf).repeat(SQUARE_CELLS, 0).repeat(SQUARE_CELLS, 1)
+    level = enlarge_cells(jnp.where(is_sheet, level, -jnp.inf), SQUARE_CELLS)
     level = level[: n - 2 * margin, : n - 2 * margin]
     return lowest < jnp.pad(level, margin, constant_values=-jnp.inf) + SHEET_STEP_M
 

@@ -12,11 +12,11 @@ from jaxbox.config import DetectorConfig, GroundConfig
 from jaxbox.config.capacities import obstacle_capacity
 from jaxbox.config.schema import GROUND_CANDIDATE_CELL_M
 from jaxbox.geometry.planar import plane_residual
-from jaxbox.stages._grids import sum_of_neighbours
 from jaxbox.stages._sheets import on_sheets
 from jaxbox.stages.state import Ground, Obstacles, Sweep
 from jaxbox.types import GroundPlane
 from jaxbox.xla import chunks
+from jaxbox.xla.grids import margin_cells, window_counts
 from jaxbox.xla.hashing import hashed_uniform
 from jaxbox.xla.least_squares import refit_plane
 from jaxbox.xla.loops import apply_in_turn, map_batches, repeat
@@ -48,12 +48,8 @@ SUPPORT_SQUARE_M = 2.0
 """Edge of the squares in which points support each other as ground."""
 
 
-SUPPORT_REACH = 1
-"""Squares on either side whose points count, too: 3 x 3."""
-
-
-SUPPORT_LEVELS_PER_M = 10.0
-"""Heights are compared in levels of .1 m."""
+SUPPORT_LEVELS_PER_M, SUPPORT_LEVELS = 10.0, 12
+"""Heights are compared in levels of .1 m, and a level with so many from it on."""
 
 
 SENSOR_LEVELS, PLANE_LEVELS = range(-100, 28), range(-13, 11)
@@ -201,32 +197,24 @@ def least_supported(
     Reference: oracle `jaxbox.reference.least_supported`.
     """
     num_levels = len(levels)
-    num_rows, num_columns = shape = [math.ceil(2 * half_m / SUPPORT_SQUARE_M) for half_m in halves_m]
-    level = jnp.floor(z * SUPPORT_LEVELS_PER_M).astype(jnp.int32) - levels.start
+    shape = math.ceil(2 * halves_m[0] / SUPPORT_SQUARE_M), math.ceil(2 * halves_m[1] / SUPPORT_SQUARE_M)
     row, column = (
         jnp.clip(jnp.floor((xy[:, a] + halves_m[a]) / SUPPORT_SQUARE_M).astype(jnp.int32), 0, shape[a] - 1)
         for a in (0, 1)
     )
-    place = (jnp.clip(level, 0, num_levels - 1) * num_rows + row) * num_columns + column
-    num_places = num_levels * num_rows * num_columns
-    count = jnp.zeros(num_places, jnp.int32).at[jnp.where(mask, place, num_places)].add(1, mode="drop")
-    count = count.reshape(num_levels, *shape)
-    for axis in (1, 2):
-        count = sum_of_neighbours(count, axis, SUPPORT_REACH)
-    about = count.astype(jnp.float32)
-    about = about + _from_level(about, 1)
-    four = about + _from_level(about, 2)
-    twelve = four + _from_level(four, 4) + _from_level(four, 8)
-    supported = about >= jnp.maximum(config.min_support_share * twelve, config.min_support_points)
+    square = margin_cells(row, column, shape)
+    level = jnp.floor(z * SUPPORT_LEVELS_PER_M).astype(jnp.int32) - levels.start
+    level = jnp.clip(level, 0, num_levels - 1)
+    count = window_counts(
+        level, square, mask, num_levels=num_levels, num_above=SUPPORT_LEVELS - 1, shape=shape
+    )
+    two = count[:-1] + count[1:]
+    four = two[:-2] + two[2:]
+    twelve = four[:-8] + four[4:-4] + four[8:]
+    supported = two[:num_levels] >= jnp.maximum(config.min_support_share * twelve, config.min_support_points)
     least = np.array(levels, np.float32) / np.float32(SUPPORT_LEVELS_PER_M)
     least[0] = -np.inf
-    least = jnp.min(jnp.where(supported, least[:, None, None], jnp.inf), axis=0)
-    return lookup(least, row, column)
-
-
-def _from_level(count: jax.Array, level: int) -> jax.Array:
-    """The counts of the levels that are higher by this many; 0 beyond the last."""
-    return jnp.pad(count[level:], ((0, level), (0, 0), (0, 0)))
+    return lookup(jnp.min(jnp.where(supported, least[:, None], jnp.inf), axis=0), square)
 
 
 def spread_points(

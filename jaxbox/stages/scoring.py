@@ -26,6 +26,7 @@ from jaxbox.stages.state import (
     Obstacles,
     RayFractions,
 )
+from jaxbox.xla import chunks
 from jaxbox.xla.loops import map_rows
 from jaxbox.xla.rows import compact, take
 from jaxbox.xla.sorting import best_first, select_highest
@@ -108,7 +109,9 @@ def score_boxes(
         candidates = _finish((rectangle, label, cluster, *others, around), reach, clusters, settings)
         return dataclasses.replace(candidates, bottom=candidates.bottom + ground)
 
-    candidates = map_rows(finish, (*picked, around), num_rows=num)
+    # Many at a time where they are looked up in the ground grid, see `map_rows`.
+    chunk = chunks.BOXES if config.ground.surface else 1
+    candidates = map_rows(finish, (*picked, around), num_rows=num, chunk=chunk)
     order = best_first(candidates.score, num)
     ordered = map_rows(lambda row: jax.tree.map(lambda a: take(a, row), candidates), order, num_rows=num)
     return dataclasses.replace(ordered, num=num)

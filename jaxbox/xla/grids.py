@@ -75,6 +75,68 @@ def _of_occupied(function: Callable[[jax.Array], jax.Array], sums: jax.Array) ->
     return for_chunks(num, chunks.FILTER_BLOCKS, step, blocks)
 
 
+def margin_cells(row: jax.Array, column: jax.Array, shape: tuple[int, int]) -> jax.Array:
+    """Cells of a grid with an empty column after each row. Law: ``row * (num_columns + 1) + column``.
+
+    Args:
+      row: (N,) int32.
+      column: (N,) int32.
+      shape: static, rows and columns.
+
+    Returns:
+      (N,) int32, stored once for all that read it.
+    """
+    return materialize(row * (shape[1] + 1) + column)
+
+
+def window_counts(
+    level: jax.Array,
+    cell: jax.Array,
+    valid: jax.Array,
+    *,
+    num_levels: int,
+    num_above: int,
+    shape: tuple[int, int],
+) -> jax.Array:
+    """Counts points by level in the 3 x 3 cells round each. Law: a histogram, and sums of shifted grids.
+
+    The margin is one empty column after each row and one empty row after each level, so that neighbours are a
+    fixed distance apart in one long vector: sums of shifted slices of it vectorise, whatever the columns.
+
+    Args:
+      level: (N,) int32, in [0, num_levels).
+      cell: (N,) int32, see `margin_cells`.
+      valid: (N,) bool, points that count.
+      num_levels: static, L.
+      num_above: static, empty levels above those.
+      shape: static, rows and columns of the grid.
+
+    Returns:
+      (L + num_above, cells) float32, whole numbers; of cells of the margin anything finite.
+    """
+    width = shape[1] + 1
+    size, before = (shape[0] + 1) * width, width + 1
+    length = (num_levels + num_above) * size + 2 * before
+    place = jnp.where(valid, level * size + cell + before, length)
+    count = jnp.zeros(length, jnp.int32).at[place].add(1, mode="drop")
+    for step in (width, 1):
+        count = count[: -2 * step] + count[step:-step] + count[2 * step :]
+    return materialize(count.reshape(-1, size).astype(jnp.float32))
+
+
+def enlarge_cells(grid: jax.Array, times: int) -> jax.Array:
+    """Squares of cells in place of each. Law: ``grid.repeat(times, 0).repeat(times, 1)``.
+
+    Args:
+      grid: (X, Y), stored first: else each cell of a square would compute it again (XLA, CPU).
+      times: static, cells along an edge of a square.
+
+    Returns:
+      (times X, times Y).
+    """
+    return materialize(grid).repeat(times, 0).repeat(times, 1)
+
+
 def window_sums(sums: jax.Array, stride: int, weight: jax.Array) -> jax.Array:
     """Weighted sums over the 3 x 3 x 3 windows of all cells but the margins. Law: a separable convolution.
 
@@ -95,4 +157,6 @@ def window_sums(sums: jax.Array, stride: int, weight: jax.Array) -> jax.Array:
     else:
         for step in (stride, 1):
             sums = sums[step:-step] + weight * (sums[: -2 * step] + sums[2 * step :])
+        # Stored, or each of three neighbours would add the same nine cells up.
+        sums = materialize(sums)
     return sums[:, 4:-4] + weight * (sums[:, :-8] + sums[:, 8:])

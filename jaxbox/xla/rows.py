@@ -346,6 +346,8 @@ def count_each(*masks: jax.Array) -> jax.Array:
         for k, mask in enumerate(masks)
     ]
     words = [functools.reduce(jnp.add, of_mask[k : k + per_word]) for k in range(0, len(masks), per_word)]
+    # A sum does not vectorise what it has to work out first.
+    words = materialize(words)
     sums = jnp.stack([jnp.sum(word.reshape(-1, WORD_BITS), axis=1, dtype=jnp.int32) for word in words])
     place = jnp.arange(per_word, dtype=jnp.int32)[None, :, None] * bits
     counts = (sums[:, None] >> place) & (2**bits - 1)

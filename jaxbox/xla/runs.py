@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.barriers import materialize
 from jaxbox.xla.loops import for_chunks
 from jaxbox.xla.rows import prefix_max, prefix_sum, split_index
 
@@ -17,6 +18,9 @@ COUNT_BITS = chunks.RUN_ROWS.bit_length()
 
 COUNTS_PER_WORD = 5
 """Such counts that a word of 32 bits holds."""
+
+WORD_COUNT_BITS = COUNTS_PER_WORD * COUNT_BITS
+"""Bits of a word that hold counts."""
 
 
 def fold_runs(
@@ -84,9 +88,12 @@ def count_kinds(kinds: Sequence[jax.Array], level: jax.Array, num_levels: int) -
     """
     digits = [jnp.where(kind, jnp.int32(1 << k * COUNT_BITS), 0) for k, kind in enumerate(kinds)]
     first = functools.reduce(jnp.add, digits)
-    place, digit = split_index(level, COUNTS_PER_WORD)
+    # Stored, or each word would work it out anew; a division by the counts of a word takes as long again.
+    bit = materialize(level * COUNT_BITS)
     word = jnp.arange(num_levels // COUNTS_PER_WORD, dtype=jnp.int32)[:, None, None]
-    others = jnp.where(place[None] == word, 1 << digit * COUNT_BITS, 0)
+    # Bits of the words before are negative, and so too large without a sign.
+    bit = (bit[None] - word * WORD_COUNT_BITS).astype(jnp.uint32)
+    others = jnp.where(bit < WORD_COUNT_BITS, jnp.uint32(1) << bit, 0).astype(jnp.int32)
     sums = jnp.sum(first, axis=1, dtype=jnp.int32), jnp.sum(others, axis=2, dtype=jnp.int32)
     words = jnp.concatenate([sums[0][:, None], sums[1].T], axis=1)
     digit = jnp.arange(COUNTS_PER_WORD, dtype=jnp.int32)[None, None]
