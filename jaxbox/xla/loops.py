@@ -60,9 +60,9 @@ def map_rows(
 
     Work is proportional to the rows that are there, not to the capacity, and what a chunk needs
     stays in the cache. Row by row, XLA compiles the loop to native code on a CPU as long as a row reads and
-    writes little: for some hundred rows that is as fast as a dozen kernels, and far less to compile. A look-up
-    counts as reading all of its table: with a large one, each operation on each row would be a call. On an
-    accelerator the function is called once, for all rows.
+    writes little: for some hundred rows that is as fast as a dozen kernels, and far less to compile. To look
+    something up counts as reading all of the table: with a large one, each operation on each row would be a
+    call. On an accelerator the function is called once, for all rows.
 
     Args:
       function: maps a pytree of (chunk, ...) arrays to another one.
