@@ -48,7 +48,7 @@ def two_maps():
 
 @parity.PerForm
 def propose(xy, height, num_points):
-    obstacles = Obstacles(jnp.arange(ROOM), xy, height, num_points, ROOM)
+    obstacles = Obstacles(jnp.arange(ROOM), xy, jnp.zeros_like(height), height, num_points, ROOM)
     return propose_clusters(obstacles, two_maps())
 
 

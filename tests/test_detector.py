@@ -285,11 +285,11 @@ def test_in_a_turned_or_mirrored_world_the_good_boxes_turn_with_it(seed, name):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_in_any_order_of_the_points_the_good_boxes_are_found_again(seed):
-    shuffled = np.random.default_rng(seed).permutation(street(seed).xyz)
-    boxes = rectangles(found(seed), GOOD_SCORE)
-    assert len(boxes) > 0
-    assert_all_found_again(boxes, run(shuffled))
+def test_in_any_order_of_the_points_the_boxes_are_the_same(seed):
+    shuffled = run(np.random.default_rng(seed).permutation(street(seed).xyz))
+    assert np.sum(found(seed).valid) > 10
+    for name in ("center", "size", "yaw", "score", "label", "valid"):
+        np.testing.assert_allclose(getattr(shuffled, name), getattr(found(seed), name), atol=1e-4)
 
 
 def test_points_that_are_not_finite_change_no_box():

@@ -72,6 +72,7 @@ def operands(seed, *, rows=None, **fields):
     obstacles = Obstacles(
         jnp.arange(NUM_POINTS),
         jnp.asarray(xy, jnp.float32),
+        jnp.zeros(NUM_POINTS, jnp.float32),
         jnp.asarray(height, jnp.float32),
         jnp.int32(NUM_POINTS),
         NUM_POINTS,

@@ -45,6 +45,8 @@ def with_room(config, sizes):
     return dataclasses.replace(config, maps=tuple(ComponentMap(max_clusters=size) for size in sizes))
 
 
+sampling_rank = parity.PerForm(clustering.sampling_rank)
+sampled_share = parity.PerForm(clustering.sampled_share, static_argnames="max_points")
 list_points = parity.PerForm(ragged.list_points, static_argnames=("num_clusters", "max_points"))
 
 
@@ -345,7 +347,10 @@ def test_fitted_points_are_exactly_those_of_the_reference(cases):
         few = np.bincount(case.slot[in_slab & (case.slot >= 0)], minlength=len(case.proposals))
         few = few < settings.min_slab_points
         used = (case.slot >= 0) & (in_slab | few[case.slot])
-        xy = case.obstacles.xyz[:, :2].astype(np.float32)
+        xy, z = np.split(case.obstacles.xyz.astype(np.float32), [2], axis=1)
+        rank = np.asarray(sampling_rank(xy, z[:, 0]))
+        num = np.bincount(case.slot[used], minlength=len(case.proposals)).astype(np.int32)
+        used &= rank < np.asarray(sampled_share(num, max_points=settings.max_points))[case.slot]
         rows = np.flatnonzero(used)
         lists = list_points(
             parity.pad(case.slot[rows], parity.MAX_OBSTACLES),
@@ -357,7 +362,12 @@ def test_fitted_points_are_exactly_those_of_the_reference(cases):
         )
         x, y, count = map(np.asarray, lists.table(np.arange(parity.MAX_CLUSTERS)))
         assert not count[len(case.proposals) :].any()
+        # Points on the edges of cells, which single precision puts into either.
+        on_edges = set(np.flatnonzero(rank != reference.sampling_rank(case.obstacles.xyz)))
+        assert len(on_edges) < 1e-3 * len(rank)
         for row, proposal in enumerate(case.proposals):
-            expected = reference.fit_points(proposal.members, height, settings)
+            expected = reference.fit_points(proposal.members, case.obstacles.xyz, height, settings)
+            if set(proposal.members) & on_edges:
+                continue
             points = np.stack([x[: count[row], row], y[: count[row], row]], axis=1)
             np.testing.assert_array_equal(points, xy[expected])

@@ -25,7 +25,9 @@ NUM_RANDOM = 300
 def count_points_around(boxes, tops, recess, past_ends, sure, num_boxes, xy, height, num_points):
     fields = {"count_max_height_m": tops, "recess_m": recess, "past_ends_m": past_ends}
     prior = dataclasses.replace(SETTINGS.classes[0], **fields)
-    obstacles = Obstacles(jnp.arange(len(xy)), xy, height, jnp.int32(num_points), len(xy))
+    obstacles = Obstacles(
+        jnp.arange(len(xy)), xy, jnp.zeros_like(height), height, jnp.int32(num_points), len(xy)
+    )
     region = parity.CONFIG.region
     return _surroundings.count_points_around(boxes, prior, sure, num_boxes, obstacles, SETTINGS, region)
 

@@ -402,15 +402,38 @@ def test_unknown_criterion_is_refused_by_name():
         reference.try_rotations(np.ones((3, 2)), BoxConfig(criterion="perimeter"))
 
 
-def test_fit_points_are_the_slab_or_all_and_spread_evenly():
+def test_fit_points_are_the_slab_or_all_and_of_many_those_of_the_lowest_ranks():
     members = np.arange(100, 120)
+    xyz = np.zeros((200, 3))
+    xyz[members, :2] = 10 * directions(np.arange(0.5, 20) / 652)
     height = np.zeros(200)
     height[104:] = 0.5
     rule = functools.partial(BoxConfig, slab_min_height_m=0.2, slab_max_height_m=0.8, min_slab_points=5)
     many, few = rule(max_points=99), rule(max_points=5)
-    assert reference.fit_points(members, height, many).tolist() == list(range(104, 120))
-    assert reference.fit_points(members, height, few).tolist() == [104, 107, 110, 113, 116]
-    assert reference.fit_points(members[:8], height, many).tolist() == list(range(100, 108))
+    assert reference.fit_points(members, xyz, height, many).tolist() == list(range(104, 120))
+    assert reference.fit_points(members[:8], xyz, height, many).tolist() == list(range(100, 108))
+    # Multiples of the golden ratio, modulo 1, below 4 / 16.
+    golden = np.arange(20) * (5**0.5 - 1) / 2 % 1
+    lowest = [100 + i for i in range(4, 20) if golden[i] < 4 / 16]
+    assert reference.fit_points(members, xyz, height, few).tolist() == lowest
+    assert len(lowest) == 4
+
+
+def directions(azimuth):
+    return np.stack([np.cos(azimuth), np.sin(azimuth)], axis=1)
+
+
+@pytest.mark.parametrize("cells_apart", [0.25, 0.5, 1, 1.94, 2, 3, 3.75, 4, 5])
+@pytest.mark.parametrize("num_points", [256, 1024])
+def test_points_of_the_lowest_ranks_are_about_as_many_as_asked_for_and_spread_over_all(
+    cells_apart, num_points
+):
+    azimuth = np.arange(num_points // 4) * cells_apart / 652 + 0.3
+    z = np.repeat([-0.7, -0.5, -0.3, -0.1], len(azimuth))
+    xyz = np.column_stack([np.tile(10 * directions(azimuth), (4, 1)), z])
+    chosen = reference.sampling_rank(xyz) < reference.sampled_share(num_points, 144)
+    assert 90 <= chosen.sum() <= 144
+    assert chosen.reshape(4, 4, -1).sum(axis=(0, 2)).min() >= 16
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, 2.0])

@@ -95,6 +95,16 @@ def test_every_bit_of_a_word_can_be_the_lowest_or_the_only_one():
 BINS = 64
 
 
+@pytest.mark.parametrize("size", [2, 16, 4096, 2**31])
+def test_lattice_numbers_are_fractions_of_a_sum_of_multiples(size):
+    i, j = np.random.default_rng(size).integers(-(2**15), 2**15, (2, 1000))
+    numbers = np.asarray(hashing.lattice_numbers(jnp.asarray(i, jnp.int32), jnp.asarray(j, jnp.int32), size))
+    golden, plastic = (1 + 5**0.5) / 2, np.roots([1, 0, -1, -1]).real.max()
+    turn = numbers / size - (i / golden + j / plastic)
+    # The ratios have 32 bits, and the numbers are rounded down.
+    assert np.abs((turn + 0.5) % 1 - 0.5 + 0.5 / size).max() <= 0.5 / size + 2**16 / 2**32
+
+
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("shape", [(20_000,), (200, 100)])
 def test_hashed_numbers_are_as_likely_everywhere_and_do_not_hang_together(seed, shape):

@@ -166,13 +166,15 @@ def test_rows_that_are_not_kept_are_zeros_whatever_they_hold(density):
 
 
 @pytest.mark.parametrize("size", [1, 2, 1000])
-def test_a_pair_is_looked_up_as_the_number_and_the_flag(size):
+@pytest.mark.parametrize("num_bits", [1, 14])
+def test_a_pair_is_looked_up_as_its_two_numbers(size, num_bits):
     rng = np.random.default_rng(size)
-    number, flag = rng.integers(0, 2**30, size, np.int32), rng.random(size) < 0.5
-    number[0], index = 2**30 - 1, rng.integers(0, size, (9, 7), np.int32)
-    found = rows.lookup_pair(rows.pack_pairs(jnp.asarray(number), jnp.asarray(flag)), jnp.asarray(index))
+    number, small = (rng.integers(0, 2**bits, size, np.int32) for bits in (31 - num_bits, num_bits))
+    number[0], small[0], index = 2 ** (31 - num_bits) - 1, 2**num_bits - 1, rng.integers(0, size, (9, 7))
+    packed = rows.pack_pairs(jnp.asarray(number), jnp.asarray(small), num_bits)
+    found = rows.lookup_pair(packed, jnp.asarray(index, jnp.int32), num_bits)
     np.testing.assert_array_equal(found[0], number[index])
-    np.testing.assert_array_equal(found[1], flag[index])
+    np.testing.assert_array_equal(found[1], small[index])
 
 
 @pytest.mark.parametrize("size", [1, 2, 7, 2**20])

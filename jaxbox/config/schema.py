@@ -230,8 +230,9 @@ class BoxConfig:
     """static: A, rotations tried over 90 degrees."""
     fit_to: Literal["slab", "hull"] = _static(default="slab")
     """static: fit to points of the cluster between two heights, or to its convex hull (the paper)."""
-    max_points: int = _static(default=128)
-    """static: M, points of a cluster that the rectangle is fitted to, spread evenly over it."""
+    max_points: int = _static(default=144)
+    """static: M, points of a cluster that the rectangle is fitted to; of more about .8 M, spread evenly by
+    their direction, the same in any order of the points."""
     max_slab_points: int | None = _static(default=None)
     """static: capacity for points between the slab's heights; None is 1/4 of the cloud's capacity."""
     slab_min_height_m: Scalar = 0.2

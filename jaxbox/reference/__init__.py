@@ -18,6 +18,8 @@ from jaxbox.reference.clustering import (
     find_clusters,
     label_components,
     propose_clusters,
+    sampled_share,
+    sampling_rank,
     select_clusters,
 )
 from jaxbox.reference.completion import (
@@ -272,6 +274,8 @@ __all__ = [
     "reach_of_beams",
     "rectangle_candidates",
     "remove_ground",
+    "sampled_share",
+    "sampling_rank",
     "scene_preference",
     "score_box",
     "score_boxes",

@@ -9,6 +9,12 @@ from scipy.spatial import KDTree
 from jaxbox.config import ClusteringConfig, ComponentMap, DetectorConfig, RegionConfig
 from jaxbox.reference.state import NO_CLUSTER, Cluster, Clusters, Obstacles
 
+NUM_RANKS = 2**12
+"""Ranks of points are numbers below this."""
+
+PLASTIC_RATIO = 1.324717957244746
+"""The real root of x^3 = x + 1."""
+
 
 def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> list[Clusters]:
     """Labels the components of every map, and lists the clusters that pass the size gates.
@@ -50,6 +56,39 @@ def find_clusters(obstacles: Obstacles, component_map: ComponentMap, config: Det
     return Clusters(
         component, of_point, _list_clusters(of_point, height), count_runs(cells, shape), num_found
     )
+
+
+def sampled_share(num_points: int, max_points: int) -> int:
+    """Up to which rank the points of a cluster are looked at: all of few, else about .8 max_points.
+
+    Args:
+      num_points: of the cluster.
+      max_points: how many are looked at, at most.
+
+    Returns:
+      In [0, NUM_RANKS].
+    """
+    if num_points <= max_points:
+        return NUM_RANKS
+    return round(0.8 * max_points) * NUM_RANKS // num_points
+
+
+def sampling_rank(xyz: np.ndarray) -> np.ndarray:
+    """Ranks points by the cells of azimuth (1 / 652 rad) and slope (.005 m/m) that they lie in.
+
+    Cell i, j has rank i / golden ratio + j / plastic ratio, modulo 1.
+
+    Args:
+      xyz: (n, 3) m, sensor frame.
+
+    Returns:
+      (n,) int, in [0, NUM_RANKS).
+    """
+    x, y, z = xyz.T
+    column = np.floor(np.arctan2(y, x) * 652).astype(int)
+    circle = np.floor(z / np.maximum(np.hypot(x, y), 0.1) * 200).astype(int)
+    golden, plastic = (int(2**32 / ratio) for ratio in ((1 + 5**0.5) / 2, PLASTIC_RATIO))
+    return (column * golden + circle * plastic) % 2**32 * NUM_RANKS // 2**32
 
 
 def _list_clusters(of_point: np.ndarray, height: np.ndarray) -> list[Cluster]:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from jaxbox.config import BoxConfig, DetectorConfig
+from jaxbox.reference.clustering import sampled_share, sampling_rank
 from jaxbox.reference.state import Cluster, Obstacles
 
 
@@ -24,18 +25,21 @@ def outline_clusters(
     """
     if config.box.fit_to == "hull":
         return convex_hulls([obstacles.xyz[cluster.members, :2] for cluster in clusters])
-    chosen = (fit_points(cluster.members, obstacles.height, config.box) for cluster in clusters)
+    points = obstacles.xyz, obstacles.height
+    chosen = (fit_points(cluster.members, *points, config.box) for cluster in clusters)
     return [obstacles.xyz[rows, :2] for rows in chosen]
 
 
-def fit_points(members: np.ndarray, height: np.ndarray, config: BoxConfig) -> np.ndarray:
+def fit_points(members: np.ndarray, xyz: np.ndarray, height: np.ndarray, config: BoxConfig) -> np.ndarray:
     """The members of a cluster that its rectangle is fitted to.
 
     Args:
       members: (m,) int, rows of the cluster's points in sweep order.
-      height: (n,) m above the ground, of all points.
+      xyz: (n, 3) m, sensor frame, of all points.
+      height: (n,) m above the ground, likewise.
       config: members between the slab's heights, both exclusive, are taken, unless they are too few: then
-        all are. At most `max_points`, spread evenly: the floor(j count / max_points)-th.
+        all are. Of more than `max_points` those of the lowest ranks, see `sampling_rank`, and of these,
+        where they are too many, `max_points` spread evenly: the floor(j count / max_points)-th.
 
     Returns:
       (k,) int, k <= max_points.
@@ -44,6 +48,7 @@ def fit_points(members: np.ndarray, height: np.ndarray, config: BoxConfig) -> np
         (height[members] > config.slab_min_height_m) & (height[members] < config.slab_max_height_m)
     ]
     chosen = slab if len(slab) >= config.min_slab_points else members
+    chosen = chosen[sampling_rank(xyz[chosen]) < sampled_share(len(chosen), config.max_points)]
     if len(chosen) <= config.max_points:
         return chosen
     return chosen[np.arange(config.max_points) * len(chosen) // config.max_points]

@@ -9,12 +9,30 @@ import jax.numpy as jnp
 
 from jaxbox.config import BoxConfig, ClusteringConfig, DetectorConfig, RegionConfig, VehicleConfig
 from jaxbox.stages.state import Clusters, Obstacles
+from jaxbox.xla.arithmetic import arctan2
 from jaxbox.xla.components import NONE, CellGrids, label_components
+from jaxbox.xla.hashing import lattice_numbers
 from jaxbox.xla.loops import map_rows
 from jaxbox.xla.maps import flag_cells, map_tables
 from jaxbox.xla.rows import compact, lookup_pair, pack_pairs, take
 from jaxbox.xla.segments import reduce_segments, segment_minima
 from jaxbox.xla.sorting import compact_groups
+
+NUM_RANKS = 4096
+"""Points are ranked by numbers below this."""
+
+SHARE_BITS = 14
+"""Of twice as many numbers, and some more."""
+
+COLUMNS_PER_RAD, CIRCLES_PER_UNIT = 652, 200
+"""Cells that points are ranked by: .088 degrees of azimuth, half the angle between two beams of most sensors,
+and .005 m/m of slope, which holds the points of one circle of beams or a few."""
+
+MIN_RANGE_M = 0.1
+"""Nearer points are ranked as if at this range: their slope has no bound."""
+
+SAMPLED_SHARE = 0.8
+"""So much of `max_points` is looked at in the mean: hardly any cluster has that much more than its share."""
 
 
 def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Clusters:
@@ -47,8 +65,9 @@ def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Clusters:
         statistics, components.first, config.clustering, min_extent_m=config.vehicles.min_extent_m
     )
     fit_all = chosen.num_slab.astype(jnp.float32) < config.box.min_slab_points
-    of_point, fitted = _find_clusters(obstacles, component, chosen.row, fit_all, config.box)
     num_fitted = jnp.where(fit_all, chosen.num_points, chosen.num_slab)
+    share = sampled_share(num_fitted, config.box.max_points)
+    of_point, fitted = _find_clusters(obstacles, component, chosen.row, fit_all, share, config.box)
     large, num_large = _large_clusters(chosen, config.vehicles)
     return Clusters(
         component=component[0, :num] - 1,
@@ -284,27 +303,81 @@ def select_clusters(
 
 
 def _find_clusters(
-    obstacles: Obstacles, component: jax.Array, row: jax.Array, fit_all: jax.Array, config: BoxConfig
+    obstacles: Obstacles,
+    component: jax.Array,
+    row: jax.Array,
+    fit_all: jax.Array,
+    share: jax.Array,
+    config: BoxConfig,
 ) -> tuple[jax.Array, jax.Array]:
     """The cluster of each point on each map, and whether a rectangle is fitted to it.
 
-    Rectangles are fitted to points between the slab's heights, or to all of the clusters with few of those.
+    Rectangles are fitted to points between the slab's heights, or to all of the clusters with few of those;
+    of many points to a share.
     """
     num_clusters = fit_all.shape[0]
-    cluster_and_all = pack_pairs(row, take(fit_all, row))
+    # Shares beyond the greatest say that points outside the slab count, too.
+    share_and_all = jnp.where(fit_all, share + NUM_RANKS + 1, share)
+    packed = pack_pairs(row, take(share_and_all, row), SHARE_BITS)
 
-    def find(component: jax.Array, in_slab: jax.Array) -> tuple[jax.Array, jax.Array]:
-        cluster, every = lookup_pair(cluster_and_all, component)
-        return cluster, (cluster < num_clusters) & (in_slab | every)
+    def prepare(columns: tuple[jax.Array, ...]) -> tuple[jax.Array, jax.Array]:
+        xy, z, height = columns
+        return _in_slab(height, config), sampling_rank(xy, z)
+
+    def find(component: jax.Array, shared: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        in_slab, rank = shared
+        cluster, share = lookup_pair(packed, component, SHARE_BITS)
+        every = share > NUM_RANKS
+        sampled = rank < jnp.where(every, share - (NUM_RANKS + 1), share)
+        return cluster, (cluster < num_clusters) & (in_slab | every) & sampled
 
     return map_tables(
         find,
         component,
         num_rows=obstacles.count,
         init=(jnp.full(component.shape, num_clusters, jnp.int32), jnp.zeros(component.shape, bool)),
-        prepare=lambda height: _in_slab(height, config),
-        columns=obstacles.height,
+        prepare=prepare,
+        columns=(obstacles.xy, obstacles.z, obstacles.height),
     )
+
+
+def sampled_share(num_points: jax.Array, max_points: int) -> jax.Array:
+    """Up to which rank the points of clusters are looked at, so that they are about `max_points`.
+
+    Args:
+      num_points: (P,) int32.
+      max_points: static, M.
+
+    Returns:
+      (P,) int32, in [0, NUM_RANKS].
+
+    Reference: oracle `jaxbox.reference.sampled_share`.
+    """
+    aim = jnp.int32(round(SAMPLED_SHARE * max_points) * NUM_RANKS)
+    share = jax.lax.div(aim, jnp.maximum(num_points, 1))
+    return jnp.where(num_points <= max_points, NUM_RANKS, share)
+
+
+def sampling_rank(xy: jax.Array, z: jax.Array) -> jax.Array:
+    """Ranks points by their direction, so that those up to any rank are spread evenly over the sweep.
+
+    The azimuth cells of one circle of beams are ranked by multiples of the golden ratio, modulo 1: of any n
+    neighbours the first ones are nearly as far apart as they can be. Each circle begins elsewhere. So the
+    same points are looked at in any order of the sweep, and one that moves, comes or goes changes no other.
+
+    Args:
+      xy: (N, 2) float32, m, sensor frame.
+      z: (N,) float32, m, likewise.
+
+    Returns:
+      (N,) int32, in [0, NUM_RANKS).
+
+    Reference: oracle `jaxbox.reference.sampling_rank`.
+    """
+    column = jnp.floor(arctan2(xy[:, 1], xy[:, 0]) * COLUMNS_PER_RAD)
+    rho = jnp.maximum(jnp.sqrt(xy[:, 0] ** 2 + xy[:, 1] ** 2), MIN_RANGE_M)
+    circle = jnp.floor(z / rho * CIRCLES_PER_UNIT)
+    return lattice_numbers(column.astype(jnp.int32), circle.astype(jnp.int32), NUM_RANKS)
 
 
 def lowest_z(z: jax.Array, obstacles: Obstacles, clusters: Clusters) -> jax.Array:

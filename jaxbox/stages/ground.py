@@ -95,8 +95,8 @@ def gather_obstacles(sweep: Sweep, ground: Ground, config: DetectorConfig) -> Ob
     low_m, high_m = config.ground.min_height_m, config.ground.max_height_m
     between = (ground.height > low_m) & (ground.height < high_m)
     row, count = compact(sweep.inlier & between, obstacle_capacity(config, sweep.xyz.shape[0]))
-    xy, height = take(sweep.xyz, row)[:, :2], take(ground.height, row)
-    return Obstacles(row, xy, height, count, sweep.xyz.shape[0])
+    xyz, height = take(sweep.xyz, row), take(ground.height, row)
+    return Obstacles(row, xyz[:, :2], xyz[:, 2], height, count, sweep.xyz.shape[0])
 
 
 def height_above_ground(

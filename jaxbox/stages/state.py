@@ -82,6 +82,8 @@ class Obstacles:
     """(O,) int32: row of the sweep, N beyond."""
     xy: jax.Array
     """(O, 2) float32, m."""
+    z: jax.Array
+    """(O,) float32, m, sensor frame."""
     height: jax.Array
     """(O,) float32, m, above the ground."""
     count: jax.Array

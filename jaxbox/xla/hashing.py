@@ -5,8 +5,35 @@ import math
 import jax
 import jax.numpy as jnp
 
+from jaxbox.xla.bits import WORD_BITS
+
 GOLDEN_RATIO_BITS = 0x9E3779B9
 """2^32 over the golden ratio: its multiples fill the 32 bits evenly."""
+
+PLASTIC_RATIO_BITS = 0xC13FA9A9
+"""2^32 over the plastic ratio, likewise."""
+
+
+def lattice_numbers(i: jax.Array, j: jax.Array, size: int) -> jax.Array:
+    """Numbers of the cells of a plane: those below any bound are spread evenly over it (Kronecker lattice).
+
+    Law: ``size * ((i / golden ratio + j / plastic ratio) % 1)``, rounded down.
+
+    Args:
+      i: (...) int32.
+      j: (...) int32.
+      size: static, a power of 2.
+
+    Returns:
+      (...) int32, in [0, size).
+
+    >>> lattice_numbers(jnp.array([0, 1, 2, 0]), jnp.array([0, 0, 0, 1]), 16).tolist()
+    [0, 9, 3, 12]
+    """
+    # As fractions of 2^32, whose sums wrap round.
+    ratios = jnp.uint32(GOLDEN_RATIO_BITS), jnp.uint32(PLASTIC_RATIO_BITS)
+    place = i.astype(jnp.uint32) * ratios[0] + j.astype(jnp.uint32) * ratios[1]
+    return (place >> (WORD_BITS + 1 - size.bit_length())).astype(jnp.int32)
 
 
 def hashed_uniform(key: jax.Array, round_index: int, shape: tuple[int, ...]) -> jax.Array:

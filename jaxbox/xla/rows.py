@@ -275,35 +275,37 @@ def lookup_each(tables: Sequence[jax.Array], *index: jax.Array) -> list[jax.Arra
     return materialize([lookup(table, *index) for table in tables])
 
 
-def pack_pairs(number: jax.Array, flag: jax.Array) -> jax.Array:
-    """Packs a number and a flag in one word, so that one look-up finds both. Law: see `lookup_pair`.
+def pack_pairs(number: jax.Array, small: jax.Array, num_bits: int) -> jax.Array:
+    """Packs two numbers in one word, so that one look-up finds both. Law: see `lookup_pair`.
 
     Args:
-      number: (N,) int32, in [0, 2^30).
-      flag: (N,) bool.
+      number: (N,) int32, in [0, 2^(31 - num_bits)).
+      small: (N,) int32, in [0, 2^num_bits).
+      num_bits: static.
 
     Returns:
       (N,) int32.
     """
-    return 2 * number + flag.astype(jnp.int32)
+    return (number << num_bits) + small
 
 
-def lookup_pair(pairs: jax.Array, index: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Numbers and flags that `pack_pairs` packed. Law: ``number[index], flag[index]``.
+def lookup_pair(pairs: jax.Array, index: jax.Array, num_bits: int) -> tuple[jax.Array, jax.Array]:
+    """Numbers that `pack_pairs` packed. Law: ``number[index], small[index]``.
 
     Args:
       pairs: (N,) int32.
       index: (...) int32, in [0, N).
+      num_bits: static, as they were packed.
 
     Returns:
-      (...) int32 and (...) bool.
+      (...) int32 each.
 
-    >>> pairs = pack_pairs(jnp.array([5, 7]), jnp.array([True, False]))
-    >>> [part.tolist() for part in lookup_pair(pairs, jnp.array([1, 0]))]
-    [[7, 5], [False, True]]
+    >>> pairs = pack_pairs(jnp.array([5, 7]), jnp.array([1, 0]), 1)
+    >>> [part.tolist() for part in lookup_pair(pairs, jnp.array([1, 0]), 1)]
+    [[7, 5], [0, 1]]
     """
     found = lookup(pairs, index)
-    return found >> 1, found & 1 == 1
+    return found >> num_bits, found & (2**num_bits - 1)
 
 
 def split_index(index: jax.Array, size: int) -> tuple[jax.Array, jax.Array]:
