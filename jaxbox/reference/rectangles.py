@@ -58,11 +58,11 @@ def rectangle_candidates(
       config: of the detector.
 
     Returns:
-      Those at the best rotation, and, where the preset asks, those along the scene's direction: a list each.
+      Those at the best rotation, bent to the scene's direction; where the preset asks, those that know
+      nothing of it and those that keep to it: a list each.
     """
-    gains = [1.0]
-    if config.box.scene_direction and config.completion.along_scene:
-        gains.append(PREFERENCE_GAIN)
+    along_scene = config.box.scene_direction and config.completion.along_scene
+    gains = [0.0, PREFERENCE_GAIN] if along_scene else [1.0]
     return [best_rectangles(rotations, preference, gain=gain) for gain in gains]
 
 

@@ -79,11 +79,11 @@ def rectangle_candidates(
       config: of the detector.
 
     Returns:
-      That at the best rotation, and, where the preset asks, that along the scene's direction.
+      That at the best rotation, bent to the scene's direction; where the preset asks, two, of which one knows
+      nothing of that direction, and the other keeps to it.
     """
-    gains = [1.0]
-    if config.box.scene_direction and config.completion.along_scene:
-        gains.append(PREFERENCE_GAIN)
+    along_scene = config.box.scene_direction and config.completion.along_scene
+    gains = [0.0, PREFERENCE_GAIN] if along_scene else [1.0]
     return [choose_rectangles(rotations, num_clusters, preference, gain=gain) for gain in gains]
 
 
