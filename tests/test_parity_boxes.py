@@ -289,6 +289,28 @@ def fits_of(cases):
     return points, count, (lists, jnp.arange(MAX_FITS), np.int32(len(count)))
 
 
+second_peak = parity.PerForm(rectangles.second_peak)
+
+
+def test_the_second_peak_of_a_curve_is_far_from_the_best_and_nearly_as_good(platform):
+    rng = np.random.default_rng(0)
+    # Some with one peak, some with two, of which one may be across the end of the quarter turn.
+    at, height, width = rng.integers(0, 90, (2, 200)), rng.uniform(0.9, 1, (2, 200)), rng.uniform(3, 12, 200)
+    turn = np.abs(np.arange(90)[:, None, None] - at)
+    turn = np.minimum(turn, 90 - turn)
+    curve = np.max(height * np.exp(-((turn / width) ** 2)), axis=1).astype(np.float32)
+    num_points = rng.integers(20, 60, 200).astype(np.int32)
+    left = np.asarray(second_peak(curve, num_points))
+    expected = [reference.second_peak(*each) for each in zip(curve.T, num_points, strict=True)]
+    np.testing.assert_array_equal(left, np.stack(expected, axis=1))
+    changed = (left != curve).any(axis=0)
+    assert 20 < changed.sum() < 150
+    assert (num_points[changed] >= 30).all()
+    apart = np.abs(left.argmax(axis=0) - curve.argmax(axis=0))[changed]
+    assert (np.minimum(apart, 90 - apart) >= 15).all()
+    assert (left.max(axis=0) > curve.max(axis=0) - 0.03).all()
+
+
 @pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("criterion", CRITERIA)
 def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, criterion):

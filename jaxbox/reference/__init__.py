@@ -106,6 +106,7 @@ from jaxbox.reference.rectangles import (
     fit_rectangles,
     min_area_rectangle,
     rectangle_candidates,
+    second_peak,
     try_rotations,
     wrap_yaw,
 )
@@ -279,6 +280,7 @@ __all__ = [
     "scene_preference",
     "score_box",
     "score_boxes",
+    "second_peak",
     "select_clusters",
     "select_points",
     "sensor_outside",

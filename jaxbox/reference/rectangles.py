@@ -1,5 +1,6 @@
 """Rectangles by trying all rotations (paper, section 3.4, Algorithm III)."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import cv2
@@ -22,7 +23,7 @@ def fit_rectangles(outlines: Sequence[np.ndarray], config: BoxConfig) -> list[Ro
     Returns:
       The rectangles of each cluster.
     """
-    return [Rotations(*try_rotations(xy, config)) for xy in outlines]
+    return [Rotations(*try_rotations(xy, config), len(xy)) for xy in outlines]
 
 
 def best_rectangles(
@@ -59,11 +60,32 @@ def rectangle_candidates(
 
     Returns:
       Those at the best rotation, bent to the scene's direction; where the preset asks, those that know
-      nothing of it and those that keep to it: a list each.
+      nothing of it, those that keep to it, and those at a second peak of the curve: a list each.
     """
     along_scene = config.box.scene_direction and config.completion.along_scene
-    gains = [0.0, PREFERENCE_GAIN] if along_scene else [1.0]
-    return [best_rectangles(rotations, preference, gain=gain) for gain in gains]
+    if not along_scene:
+        return [best_rectangles(rotations, preference)]
+    second = [dataclasses.replace(each, curve=second_peak(each.curve, each.num_points)) for each in rotations]
+    return [
+        best_rectangles(rotations, preference, gain=0),
+        best_rectangles(rotations, preference, gain=PREFERENCE_GAIN),
+        best_rectangles(second, preference, gain=0),
+    ]
+
+
+def second_peak(curve: np.ndarray, num_points: int) -> np.ndarray:
+    """A curve without what is less than 15 degrees from its best rotation.
+
+    Args:
+      curve: (A,) larger is better.
+      num_points: that it is of.
+
+    Returns:
+      (A,); the curve itself of less than 30 points, or where nothing farther comes within .03 of the best.
+    """
+    turn = np.abs(np.arange(len(curve)) - np.argmax(curve)) * 90 / len(curve)
+    others = np.where(np.minimum(turn, 90 - turn) >= 15, curve, -np.inf)
+    return others if num_points >= 30 and others.max() > curve.max() - 0.03 else curve
 
 
 def try_rotations(xy: np.ndarray, config: BoxConfig) -> tuple[np.ndarray, np.ndarray]:

@@ -93,6 +93,8 @@ class Rotations:
     """(A,): the criterion, larger is better."""
     extents: np.ndarray
     """(A, 4) m: smallest and largest u, smallest and largest v, see `try_rotations`."""
+    num_points: int
+    """How many points they were fitted to."""
 
 
 @dataclasses.dataclass(frozen=True)

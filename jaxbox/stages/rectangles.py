@@ -14,11 +14,15 @@ from jaxbox.xla import chunks
 from jaxbox.xla.arithmetic import fast_max, fast_min
 from jaxbox.xla.loops import map_rows
 from jaxbox.xla.ragged import PointLists, PointTable, fold_points
-from jaxbox.xla.rows import first_argmax
+from jaxbox.xla.rows import first_argmax, take
 from jaxbox.xla.sorting import largest_first
 
 PREFERENCE_GAIN = 5.0
 """How often the scene's direction counts for the second candidate of a cluster: it bends a closeness only."""
+
+PEAKS_APART_DEG, MAX_PEAK_LOSS, MIN_PEAK_POINTS = 15.0, 0.03, 30
+"""A second peak differs by so much from the best rotation, is worse by less than this closeness, and is
+looked for where a rectangle is fitted to so many points: to weigh it takes time."""
 
 FAR_M = 1e12
 """Farther away than any point."""
@@ -39,7 +43,7 @@ def fit_rectangles(outlines: Outlines, num_clusters: jax.Array, config: BoxConfi
     chex.assert_equal_shape([points.start, points.total])
     order, place = largest_first(points.count, points.max_points)
     curve, extents = try_rotations(points, order, num_clusters, config)
-    return Rotations(curve, extents, place)
+    return Rotations(curve, extents, take(points.count, order), place)
 
 
 def choose_rectangles(
@@ -79,12 +83,47 @@ def rectangle_candidates(
       config: of the detector.
 
     Returns:
-      That at the best rotation, bent to the scene's direction; where the preset asks, two, of which one knows
-      nothing of that direction, and the other keeps to it.
+      That at the best rotation, bent to the scene's direction; where the preset asks, three: one that knows
+      nothing of that direction, one that keeps to it, and one at a second peak of the curve.
     """
-    along_scene = config.box.scene_direction and config.completion.along_scene
-    gains = [0.0, PREFERENCE_GAIN] if along_scene else [1.0]
-    return [choose_rectangles(rotations, num_clusters, preference, gain=gain) for gain in gains]
+    if not (config.box.scene_direction and config.completion.along_scene):
+        return [choose_rectangles(rotations, num_clusters, preference)]
+
+    def second(columns: tuple[jax.Array, ...]) -> jax.Array:
+        curve, extents, num_points = columns
+        return best_rectangles(second_peak(curve, num_points[0]), extents, preference, gain=0).rows.T
+
+    columns = rotations.curve, rotations.extents, rotations.num_points[None]
+    rows = map_rows(second, columns, num_rows=num_clusters, chunk=chunks.PROPOSALS, axis=-1)
+    return [
+        choose_rectangles(rotations, num_clusters, preference, gain=0),
+        choose_rectangles(rotations, num_clusters, preference, gain=PREFERENCE_GAIN),
+        Rectangles(rows.T[rotations.place]),
+    ]
+
+
+def second_peak(curve: jax.Array, num_points: jax.Array) -> jax.Array:
+    """What is left of curves apart from their best rotation, where something else is nearly as good.
+
+    A vehicle that is seen in part may fit nearly as well at two rotations, and a little noise decides.
+
+    Args:
+      curve: (A, P) float32, see `try_rotations`.
+      num_points: (P,) int32, that they are of.
+
+    Returns:
+      (A, P) float32: minus infinity near the best rotation. The curve itself of few points, and where no
+      other rotation is nearly as good.
+
+    Reference: oracle `jaxbox.reference.second_peak`.
+    """
+    num_angles = curve.shape[0]
+    best, greatest = first_argmax(curve)
+    turn = jnp.abs(jnp.arange(num_angles, dtype=jnp.int32)[:, None] - best[None])
+    apart_deg = jnp.minimum(turn, num_angles - turn).astype(jnp.float32) * (90 / num_angles)
+    others = jnp.where(apart_deg >= PEAKS_APART_DEG, curve, -jnp.inf)
+    has_other = (num_points >= MIN_PEAK_POINTS) & (jnp.max(others, axis=0) > greatest - MAX_PEAK_LOSS)
+    return jnp.where(has_other[None], others, curve)
 
 
 def try_rotations(

@@ -174,6 +174,8 @@ class Rotations:
     """(A, P) float32: the criterion, larger is better; the clusters with most points first."""
     extents: jax.Array
     """(4, A, P) float32, m: lower and upper bounds of u, then of v; likewise."""
+    num_points: jax.Array
+    """(P,) int32: how many points the rectangles were fitted to; likewise."""
     place: jax.Array
     """(P,) int32: where each cluster is in those."""
 
