@@ -88,7 +88,8 @@ def test_on_one_ground_plane_both_find_the_same_boxes_of_the_same_points(cases, 
             first, second = owners_of(one, count, MIN_SCORE), owners_of(other, count, 0.8 * MIN_SCORE)
             owned = first[:, 0] < 1e6
             apart = owned & (np.abs(first - second).max(axis=1) > 0.1)
-            parity.assert_share(apart.sum(), owned.sum(), 0.005, f"points of the boxes of {preset}")
+            # A box that differs, of which 2 % are let pass above, takes its points along.
+            parity.assert_share(apart.sum(), owned.sum(), 0.02, f"points of the boxes of {preset}")
 
 
 @pytest.mark.parametrize(("preset", "limit"), [("default", 0.3), ("paper", 0.4)])
