@@ -11,7 +11,7 @@ import parity
 import pytest
 from native_loops import count_loops
 
-from jaxbox import DetectorConfig, PointCloud, Status, detect, stack_clouds, synthetic
+from jaxbox import DetectorConfig, PointCloud, Status, detect, detector, stack_clouds, synthetic
 from jaxbox.config import BoxConfig, EvidenceConfig
 from jaxbox.geometry.planar import rectangle_iou
 from jaxbox.io import open_sweeps
@@ -129,6 +129,18 @@ def test_thresholds_go_in_as_one_array_that_native_loops_cut_up(preset):
     assert unpack(settings) == jax.tree.map(jnp.float32, preset)
     num_loops, num_native = count_loops(unpack, settings)
     assert num_native == num_loops > 1
+
+
+@pytest.mark.codegen
+@pytest.mark.parametrize(("preset", "most"), [("default", 38), ("fast", 35), ("paper", 22)])
+def test_a_cpu_runs_no_more_loops_operation_by_operation(preset, most):
+    # A loop over rows whose step grows is native code no longer, and says so by nothing but its time.
+    config = DetectorConfig.presets()[preset]
+    find = jax.jit(lambda cloud: detector.find_vehicles(cloud, config, jax.random.key(0)))
+    num_loops, num_native = count_loops(
+        find, PointCloud.from_numpy(np.zeros((1, 3), np.float32), capacity=2**17)
+    )
+    assert num_native <= num_loops <= num_native + most
 
 
 def test_the_same_key_gives_the_same_bits_and_none_is_key_zero():
