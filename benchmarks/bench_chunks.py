@@ -48,6 +48,7 @@ USES = {
     "HULLS": Use("fit_rectangles", "paper"),
     "ROTATIONS": Use("fit_rectangles"),
     "FOLDED_POINTS": Use("fit_rectangles"),
+    "PAIRS": Use("complete_boxes"),
     "VOTES": Use("complete_boxes"),
     "PROPOSALS": Use("complete_boxes"),
     "RAYS": Use("complete_boxes"),

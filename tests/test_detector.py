@@ -22,7 +22,7 @@ CAPACITY = 2**14
 SEEDS = range(5)
 GOOD_SCORE = 0.2
 """Boxes that a user would act on; the others may come and go with the order of the points."""
-SAME_IOU, SAME_SIZE_M, SAME_YAW = 0.8, (0.6, 0.15), np.radians(3)
+SAME_IOU, SAME_SIZE_M, SAME_YAW = 0.75, (0.6, 0.15), np.radians(3)
 """What counts as the same box: grids and samples of points fall otherwise when the sweep is turned, and a
 point more or less can decide whether a side was seen whole, and so its length."""
 

@@ -15,7 +15,7 @@ from jaxbox.tracking.trails import Trails
 
 STEP_M = 1.0
 NUM_SWEEPS = 7
-MIN_SCORE = 0.15
+MIN_SCORE, UNSURE_SCORE = 0.15, 0.1
 SEED = 5  # A street with vehicles that few beams show well.
 SWEEP_NS = 10**8
 
@@ -47,10 +47,10 @@ def drive():
     return [ArraySweep(f"{k:02d}", street - np.float32([STEP_M * k, 0, 0])) for k in range(NUM_SWEEPS)]
 
 
-def shown(tracked):
+def shown(tracked, min_score=MIN_SCORE):
     """Ids and speeds over ground of the vehicles that are sure, of a sweep."""
     tracks = tracked.tracks
-    rows = np.flatnonzero(tracks.confirmed & (tracks.score > MIN_SCORE))
+    rows = np.flatnonzero(tracks.confirmed & (tracks.score > min_score))
     return set(tracks.id[rows].tolist()), tracks.velocity[rows]
 
 
@@ -64,10 +64,10 @@ def test_a_standing_street_stands_where_the_poses_are_known(drive):
     assert [sweep.name for sweep in tracked] == [sweep.name for sweep in drive]
     assert all(sweep.status == 0 for sweep in tracked)
     np.testing.assert_allclose([sweep.T_world_sensor for sweep in tracked], T, atol=1e-9)
-    ids, velocity = shown(tracked[-1])
+    ids, velocity = shown(tracked[-1], UNSURE_SCORE)
     assert len(ids) >= 3
     assert np.abs(velocity).max() < 1.0
-    assert ids <= shown(tracked[2])[0] | shown(tracked[4])[0]
+    assert ids <= shown(tracked[2], UNSURE_SCORE)[0] | shown(tracked[4], UNSURE_SCORE)[0]
     # The row of each detection is one of the sweep's own.
     seen = tracked[-1].tracks
     rows = seen.detection[seen.detection >= 0]
@@ -222,8 +222,8 @@ def test_smoothing_keeps_the_sweeps_and_leaves_broken_ones_as_they_are(drive):
     smoothed = smooth_tracks(tracked)
     assert [sweep.name for sweep in smoothed] == [sweep.name for sweep in broken]
     assert smoothed[3] is tracked[3]
-    assert shown(smoothed[-1])[0]
-    assert np.abs(shown(smoothed[2])[1]).max() < 0.5
+    assert shown(smoothed[-1], UNSURE_SCORE)[0]
+    assert np.abs(shown(smoothed[2], UNSURE_SCORE)[1]).max() < 0.5
 
 
 @pytest.mark.parametrize(

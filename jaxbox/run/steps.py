@@ -7,6 +7,7 @@ import dataclasses
 import types
 from typing import Any
 
+import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -225,6 +226,8 @@ def _find_angles(points: PointLists, num_clusters: jax.Array, packed: PackedConf
 
 def _best_angles(xy: np.ndarray, start: np.ndarray, total: np.ndarray, config: DetectorConfig) -> np.ndarray:
     """(k,) rad, in [0, pi/2), of clusters whose points (n, 2) lie one after the other, padded."""
+    if config.box.fit_to == "hull":
+        xy, start, total = _hulls(xy, start, total)
     num_clusters, capacity = len(start), _MIN_CLUSTERS
     while capacity < num_clusters:
         capacity *= 2
@@ -239,6 +242,14 @@ def _best_angles(xy: np.ndarray, start: np.ndarray, total: np.ndarray, config: D
     lists = PointLists(x, y, begin, count, config.box.max_points)  # pyright: ignore[reportArgumentType]
     packed = PackedConfig.pack(config, accelerator=on_accelerator())
     return np.asarray(_find_angles(lists, np.int32(num_clusters), packed), np.float64)[:num_clusters]
+
+
+def _hulls(xy: np.ndarray, start: np.ndarray, total: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The convex hulls of clusters, given as their points are: the smallest rectangle is that of the hull."""
+    points = xy.astype(np.float32)
+    hulls = [cv2.convexHull(points[i : i + n])[:, 0] for i, n in zip(start, total, strict=True)]
+    sizes = np.array([len(vertices) for vertices in hulls])
+    return np.concatenate(hulls), np.cumsum(sizes) - sizes, sizes
 
 
 def _boxes_along(
