@@ -7,7 +7,6 @@ import dataclasses
 import types
 from typing import Any
 
-import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -246,6 +245,8 @@ def _best_angles(xy: np.ndarray, start: np.ndarray, total: np.ndarray, config: D
 
 def _hulls(xy: np.ndarray, start: np.ndarray, total: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The convex hulls of clusters, given as their points are: the smallest rectangle is that of the hull."""
+    import cv2  # noqa: PLC0415 (heavy: `import jaxbox` goes without)
+
     points = xy.astype(np.float32)
     hulls = [cv2.convexHull(points[i : i + n])[:, 0] for i, n in zip(start, total, strict=True)]
     sizes = np.array([len(vertices) for vertices in hulls])

@@ -78,8 +78,10 @@ def find_rows(
         second = (distance > config.row_distance_m) & (distance <= 2 * config.row_distance_m)
         first = first & parallel & (shift <= config.row_shift_m)
         second = second & parallel & (shift <= 2 * config.row_shift_m)
-        word = LEFT * first.astype(jnp.uint32) | SECOND_LEFT * second.astype(jnp.uint32)
-        return jnp.where(side > 0, word, RIGHT * word)
+        on_left = jnp.where(
+            first, jnp.uint32(LEFT), jnp.where(second, jnp.uint32(SECOND_LEFT), jnp.uint32(0))
+        )
+        return jnp.where(side > 0, on_left, RIGHT * on_left)
 
     index, num = compact(may_be, may_be.shape[0])
     places = join_pairs(take(ends, index), num, place_of)
