@@ -226,7 +226,7 @@ def _judge_assignments(
         entry, *found = rows
         return tuple(a.at[entry].set(value, mode="drop") for a, value in zip(tables, found, strict=True))
 
-    ends, may_be, prepared = map_rows(prepare, entry, num_rows=num)
+    ends, may_be, prepared = map_rows(prepare, entry, num_rows=num, chunk=chunks.PROPOSALS)
     may_be = may_be & (jnp.arange(may_be.shape[0], dtype=jnp.int32) < num)
     in_row = find_rows(ends, may_be, config.vehicles.classes[0].width_m, config.completion)
     judged = map_rows(judge, (prepared, in_row), num_rows=num, chunk=chunks.PROPOSALS)
