@@ -406,8 +406,6 @@ def test_lower_hulls_are_monotone_chains_set_by_set(num_points, kind):
         assert chain or not found[0].any()
 
 
-# Suppression.
-
 # Pairs.
 
 
@@ -416,17 +414,20 @@ def test_lower_hulls_are_monotone_chains_set_by_set(num_points, kind):
 def test_words_of_a_row_join_what_it_is_to_each_row_that_counts(size):
     rng = np.random.default_rng(size)
     rows = rng.integers(0, 100, (size, 2)).astype(np.int32)
-    bits = rng.integers(0, 2**32, 100, np.uint32)
+    flags = rng.integers(0, 2**32, 100, np.uint32)
 
     def relation(own, other):
-        return jnp.asarray(bits)[(own[0] + 3 * other[1]) % 100]
+        return jnp.asarray(flags)[(own[0] + 3 * other[1]) % 100]
 
     join = jax.jit(lambda num: pairs.join_pairs(jnp.asarray(rows), num, relation))
     for num in {0, 1, size // 2, size}:
-        words = bits[(rows[:num, None, 0] + 3 * rows[None, :num, 1]) % 100]
+        words = flags[(rows[:num, None, 0] + 3 * rows[None, :num, 1]) % 100]
         expected = np.zeros(size, np.uint32)
         expected[:num] = np.bitwise_or.reduce(words, axis=1, initial=0)
         np.testing.assert_array_equal(join(jnp.int32(num)), expected)
+
+
+# Suppression.
 
 
 @pytest.mark.usefixtures("platform")

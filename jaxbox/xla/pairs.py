@@ -11,7 +11,7 @@ from jaxbox.xla.backend import on_accelerator
 from jaxbox.xla.loops import for_chunks, whole_chunks
 
 Relation = Callable[[jax.Array, jax.Array], jax.Array]
-"""What one row is to another, () uint32: flags."""
+"""What one row is to another, (): a truth value, or flags as uint32."""
 
 
 def join_pairs(rows: jax.Array, num_rows: jax.Array, relation: Relation) -> jax.Array:
@@ -45,8 +45,22 @@ def join_pairs(rows: jax.Array, num_rows: jax.Array, relation: Relation) -> jax.
     return words[:capacity]
 
 
+def all_pairs(relation: Relation, first: jax.Array, second: jax.Array) -> jax.Array:
+    """What each row is to each other one. Law: element i, j is ``relation(first[i], second[j])``.
+
+    Args:
+      relation: of two rows.
+      first: (P, ...).
+      second: (Q, ...).
+
+    Returns:
+      (P, Q).
+    """
+    return jax.vmap(jax.vmap(relation, (None, 0)), (0, None))(first, second)
+
+
 def _join(relation: Relation, first: jax.Array, second: jax.Array, counts: jax.Array) -> jax.Array:
     # Reductions along the first axis vectorise on a CPU.
-    each = jax.vmap(jax.vmap(relation, (0, None)), (None, 0))(first, second)
+    each = all_pairs(lambda other, own: relation(own, other), second, first)
     each = jnp.where(counts.T, each, jnp.uint32(0))
     return jax.lax.reduce(each, jnp.uint32(0), jax.lax.bitwise_or, (0,))

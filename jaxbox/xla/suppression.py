@@ -1,7 +1,6 @@
 """Greedy suppression of rows by better ones, at a fixed shape."""
 
 import functools
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -9,16 +8,14 @@ import jax.numpy as jnp
 from jaxbox.xla.backend import on_accelerator
 from jaxbox.xla.bits import WORD_BITS, pack_bits
 from jaxbox.xla.loops import for_chunks, whole_chunks
+from jaxbox.xla.pairs import Relation, all_pairs
 from jaxbox.xla.rows import count_true
 
 ROUNDS = 6
 """Rounds on an accelerator before the host looks whether they were enough."""
 
-Conflict = Callable[[jax.Array, jax.Array], jax.Array]
-"""Whether two rows exclude each other, () bool."""
 
-
-def suppress_conflicts(rows: jax.Array, valid: jax.Array, conflict: Conflict) -> jax.Array:
+def suppress_conflicts(rows: jax.Array, valid: jax.Array, conflict: Relation) -> jax.Array:
     """Keeps each row that is in conflict with no earlier row that is kept. Law: the greedy loop.
 
     A row depends on earlier ones only: after k rounds over all rows the first k are right, and where nothing
@@ -48,10 +45,10 @@ def suppress_conflicts(rows: jax.Array, valid: jax.Array, conflict: Conflict) ->
     return without_rivals(jax.lax.while_loop(lambda s: jnp.any(s[0] != s[1]), step, init)[1])
 
 
-def _suppress_parallel(rows: jax.Array, valid: jax.Array, conflict: Conflict) -> jax.Array:
+def _suppress_parallel(rows: jax.Array, valid: jax.Array, conflict: Relation) -> jax.Array:
     """As `suppress_conflicts`, all pairs in parallel, several rounds before each check for convergence."""
     row = jnp.arange(valid.shape[0], dtype=jnp.int32)
-    rivals = _all_pairs(conflict, rows, rows) & (row[None] < row[:, None])
+    rivals = all_pairs(conflict, rows, rows) & (row[None] < row[:, None])
 
     def step(keep: jax.Array) -> jax.Array:
         return valid & ~jnp.any(rivals & keep[None], axis=1)
@@ -63,11 +60,7 @@ def _suppress_parallel(rows: jax.Array, valid: jax.Array, conflict: Conflict) ->
     return jax.lax.while_loop(lambda s: jnp.any(s[0] != s[1]), rounds, rounds((valid, valid)))[1]
 
 
-def _all_pairs(conflict: Conflict, first: jax.Array, second: jax.Array) -> jax.Array:
-    return jax.vmap(jax.vmap(conflict, (None, 0)), (0, None))(first, second)
-
-
-def _rivals(rows: jax.Array, num_rows: jax.Array, conflict: Conflict) -> jax.Array:
+def _rivals(rows: jax.Array, num_rows: jax.Array, conflict: Relation) -> jax.Array:
     """(P, P / 32) uint32: which earlier rows each one is in conflict with, as bits.
 
     One word of each of 32 rows at a time, and only words of rows that come earlier.
@@ -78,7 +71,7 @@ def _rivals(rows: jax.Array, num_rows: jax.Array, conflict: Conflict) -> jax.Arr
     def fill(i: jax.Array, j: jax.Array, bits: jax.Array) -> jax.Array:
         first, second = (jax.lax.dynamic_slice_in_dim(rows, k, WORD_BITS) for k in (i, j))
         earlier = j + row[None] < i + row[:, None]
-        new = pack_bits(_all_pairs(conflict, first, second) & earlier)
+        new = pack_bits(all_pairs(conflict, first, second) & earlier)
         return jax.lax.dynamic_update_slice(bits, new, (i, j // WORD_BITS))
 
     def fill_row(i: jax.Array, bits: jax.Array) -> jax.Array:
