@@ -263,8 +263,8 @@ class CompletionConfig:
     """static: keep the rectangle as measured (the paper); extend its hidden sides away from the
     sensor; or let the evidence choose among hypotheses."""
     along_scene: bool = _static(default=True)
-    """static: let the evidence choose between the rectangle at the best rotation and that along the
-    scene's direction, instead of one in between; needs ``box.scene_direction``."""
+    """static: let the evidence choose among the rectangle at the best rotation, one that fits nearly as
+    well, and that along the scene's direction, instead of one in between; needs ``box.scene_direction``."""
     seen_length: Scalar = 0.72
     """A side measured at least this long, as a fraction of the class's length, may be seen whole."""
     seen_width: Scalar = 0.83

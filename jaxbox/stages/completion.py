@@ -252,13 +252,12 @@ def _largest_first(
 
     def rank(rows: tuple[jax.Array, jax.Array]) -> jax.Array:
         cluster, label = rows
-        first, *others = (Rectangles(take(rectangles.rows, cluster)) for rectangles in candidates)
+        rectangles = [Rectangles(take(each.rows, cluster)) for each in candidates]
         prior = prior_of(config.classes, label)
-        # A second candidate at the angle of the first has nothing to add.
-        new = [jnp.ones_like(first.angle, bool), *(other.angle != first.angle for other in others)]
+        # A candidate at the angle of an earlier one has nothing to add.
         possible = [
             is_new & fits(assign_length_axis(rectangle, side), prior)
-            for rectangle, is_new in zip((first, *others), new, strict=True)
+            for rectangle, is_new in zip(rectangles, _first_of_angle(rectangles), strict=True)
             for side in sides
         ]
         missing = points.max_points - points.count_of(cluster)
@@ -269,6 +268,15 @@ def _largest_first(
     entry, begin, _ = sort_by_group(lambda i: i, ranks.reshape(-1), num_entries, points.max_points + 1)
     # Clusters have points, so that only what is not possible comes last.
     return entry, begin[points.max_points]
+
+
+def _first_of_angle(rectangles: Sequence[Rectangles]) -> list[jax.Array]:
+    """(P,) bool each: whether no earlier one is at the same angle."""
+    new = jnp.ones_like(rectangles[0].angle, bool)
+    return [
+        functools.reduce(jnp.logical_and, [each.angle != before.angle for before in rectangles[:i]], new)
+        for i, each in enumerate(rectangles)
+    ]
 
 
 @jax.tree_util.register_dataclass
