@@ -427,6 +427,12 @@ def test_words_of_a_row_join_what_it_is_to_each_row_that_counts(size):
         np.testing.assert_array_equal(join(jnp.int32(num)), expected)
 
 
+def test_all_pairs_are_each_row_with_each_other_one():
+    first, second = np.arange(6).reshape(3, 2), np.arange(10).reshape(5, 2)
+    found = pairs.all_pairs(lambda a, b: a[0] - b[1], jnp.asarray(first), jnp.asarray(second))
+    np.testing.assert_array_equal(found, first[:, None, 0] - second[None, :, 1])
+
+
 # Suppression.
 
 
