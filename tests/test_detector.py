@@ -13,6 +13,7 @@ from native_loops import count_loops
 
 from jaxbox import DetectorConfig, PointCloud, Status, detect, detector, stack_clouds, synthetic
 from jaxbox.config import BoxConfig, EvidenceConfig
+from jaxbox.config.fields import replace_fields
 from jaxbox.geometry.planar import rectangle_iou
 from jaxbox.io import open_sweeps
 from jaxbox.run import compiled
@@ -82,6 +83,29 @@ def test_one_trace_serves_sweeps_of_any_length_and_any_thresholds_and_keys(monke
     assert compiled.count_compilations() == num_compiled
     with pytest.raises(AssertionError, match="traced > 0 times"):
         run(xyz, capacity=CAPACITY + 1)
+
+
+def test_a_length_that_nothing_shows_costs_its_share_of_the_score_and_one_that_is_seen_nothing():
+    shares, lengths = [], []
+    for seed in SEEDS:
+        one, other = (
+            run(
+                street(seed).xyz, config=replace_fields(DetectorConfig(), {"vehicles.hidden_length_score": s})
+            )
+            for s in (1.0, 0.5)
+        )
+        scores = {box.tobytes(): score for box, score in zip(rectangles(one), one.score, strict=False)}
+        for box, score, label in zip(rectangles(other), other.score, other.label, strict=False):
+            if label == 0 and box.tobytes() in scores:
+                shares.append(score / scores[box.tobytes()])
+                lengths.append(box[2])
+    shares, lengths = np.array(shares), np.array(lengths)
+    hidden = shares < 0.5 + 1e-5
+    assert (shares > 0.5 - 1e-5).all()
+    assert (shares < 1 + 1e-5).all()
+    assert min(hidden.sum(), (shares > 0.9).sum()) > 5
+    # A car whose length nothing shows has the usual one.
+    np.testing.assert_allclose(lengths[hidden], DetectorConfig().vehicles.classes[0].length_m, atol=1e-5)
 
 
 def test_one_trace_serves_all_real_sweeps(data_root, monkeypatch):

@@ -196,8 +196,8 @@ def test_far_ends_are_where_the_reference_sees_them():
     columns = np.zeros((MAX_BOXES, 7), np.float32)
     columns[:, 0], columns[:, 6] = rng.integers(0, 500, MAX_BOXES), size[:, 0] * rng.uniform(0, 1, MAX_BOXES)
     rule, beam_angle = parity.CONFIG.completion, 0.004
-    ours = end_where_seen(boxes, columns, usual_m.astype(np.float32))
-    expected = [
+    ours, sure = end_where_seen(boxes, columns, usual_m.astype(np.float32))
+    answers = [
         reference.end_where_seen(
             box,
             reference.NeighbourhoodCounts(columns[row, 0], 1.5, 0, 0, deepest=float(columns[row, 6])),
@@ -207,7 +207,9 @@ def test_far_ends_are_where_the_reference_sees_them():
         )
         for row, box in enumerate(boxes.astype(float))
     ]
+    expected, expected_sure = zip(*answers, strict=True)
     np.testing.assert_allclose(ours, expected, atol=1e-4)
+    np.testing.assert_allclose(sure, expected_sure, atol=1e-4)
     moved = np.abs(np.array(expected) - boxes)[:, 2] > 1e-3
     assert 50 < moved.sum() < MAX_BOXES / 2
 

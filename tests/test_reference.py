@@ -804,7 +804,8 @@ def test_the_far_end_of_a_side_that_is_seen_is_at_its_last_point_and_a_hidden_on
 
     def length(box, **changes):
         seen = dataclasses.replace(around, **changes)
-        answered = reference.end_where_seen(np.array(box), seen, 3.9, rule, 0.004)
+        answered, sure = reference.end_where_seen(np.array(box), seen, 3.9, rule, 0.004)
+        assert (sure > 0) == (answered[2] != box[2])
         nearest = [
             np.linalg.norm(turned(each[2:4] / 2 * CORNERS, each[4]) + each[:2], axis=1).min()
             for each in (answered, np.array(box))

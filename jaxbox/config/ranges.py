@@ -70,7 +70,7 @@ _POSITIVE = """
 _SHARES = """
     ground.min_inlier_fraction ground.min_support_share box.direction_max_free completion.seen_weight
     health.min_far_share health.max_scattered_share health.max_rough_share health.max_under_share
-    vehicles.unseen_top_score
+    vehicles.hidden_length_score vehicles.unseen_top_score
     vehicles.top_quantile vehicles.upright_score vehicles.min_score vehicles.max_overlap
     birth_score high_score low_score hidden_share yaw_memory yaw_memory_moving turn_gain
 """

@@ -352,6 +352,9 @@ class VehicleConfig:
     """score x exp(-weight x ring points / points)."""
     overhead_weight: Scalar = 6.0
     """score x exp(-weight x points above / points), where those above are connected to the vehicle."""
+    hidden_length_score: Scalar = 0.7
+    """score x this where nothing shows how long the vehicle is, so that the class's length is answered; x 1
+    where its far end is seen, see ``completion.end_length``."""
     unseen_top_score: Scalar = 0.7
     """Score of the height where the top is out of sight, so that the class's height is answered: where the
     highest beam cuts a vehicle off, less where less than half of the class's width was measured; and where

@@ -246,6 +246,11 @@ def extend_away(sides: Assignment, prior: ClassPrior, config: CompletionConfig) 
     return place(sides, likely_sizes(sides, prior, config), AWAY, CERTAIN) if fits(sides, prior) else None
 
 
+def share_seen(measured_m: float, usual_m: Scalar, seen: Scalar) -> float:
+    """How sure it is that a side is seen whole: from 0 at the fraction `seen` of its usual size to 1 soon."""
+    return float(np.clip((measured_m / usual_m - seen) / SEEN_RAMP, 0, 1))
+
+
 def likely_sizes(sides: Assignment, prior: ClassPrior, config: CompletionConfig) -> tuple[float, float]:
     """The class's size for sides that may be hidden in part; between it and the measured for the others.
 
@@ -260,7 +265,7 @@ def likely_sizes(sides: Assignment, prior: ClassPrior, config: CompletionConfig)
     """
 
     def likely(measured_m: float, usual_m: Scalar, seen: Scalar, margin_m: Scalar) -> float:
-        whole = np.clip((measured_m / usual_m - seen) / SEEN_RAMP, 0, 1)
+        whole = share_seen(measured_m, usual_m, seen)
         return float(
             max(usual_m + config.seen_weight * whole * (measured_m + margin_m - usual_m), measured_m)
         )

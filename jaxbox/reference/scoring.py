@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import expit
 
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, Scalar, VehicleConfig
-from jaxbox.reference.completion import SEEN_RAMP
+from jaxbox.reference.completion import share_seen
 from jaxbox.reference.evidence import GroundElevation, closed_free_length
 from jaxbox.reference.rows import hit_share
 from jaxbox.reference.state import (
@@ -76,11 +76,10 @@ def score_boxes(
             config=config.vehicles,
         )
         around = _look_around(box.box, prior, cluster, early, obstacles, config.vehicles)
-        ends_seen = config.vehicles.neighbourhood and config.completion.mode != "none"
-        if ends_seen and not box.in_row:
-            beam_angle = 2 * np.pi / config.evidence.num_azimuths
-            seen = end_where_seen(box.box, around, float(prior.length_m), config.completion, beam_angle)
-            box = dataclasses.replace(box, box=seen)
+        if config.vehicles.neighbourhood and config.completion.mode != "none":
+            ended, seen = _end_where_seen(box, around, float(prior.length_m), config)
+            box = box if box.in_row else dataclasses.replace(box, box=ended)
+            early *= seen + float(config.vehicles.hidden_length_score) * (1 - seen)
         rho = float(np.hypot(box.box[0], box.box[1]))
         lowest_z = obstacles.xyz[cluster.members, 2].min() if config.ground.max_planes > 1 else 0.0
         where = rho, reach(box.box, lowest_z), box.measured_width_m
@@ -127,6 +126,15 @@ def _look_around(
     return count_points_around(box, prior, obstacles, config, sure=sure)
 
 
+def _end_where_seen(
+    box: CompletedBox, around: NeighbourhoodCounts, usual_m: float, config: DetectorConfig
+) -> tuple[np.ndarray, float]:
+    """The box (5,) with its end where it is seen, and how sure its length is."""
+    beam_angle = 2 * np.pi / config.evidence.num_azimuths
+    ended, seen = end_where_seen(box.box, around, usual_m, config.completion, beam_angle)
+    return ended, max(seen, share_seen(box.measured_length_m, usual_m, config.completion.seen_length))
+
+
 def keep_best(candidates: Sequence[Candidate], config: VehicleConfig) -> Kept:
     """The candidates that overlap no better one.
 
@@ -150,7 +158,7 @@ def end_where_seen(
     usual_m: float,
     config: CompletionConfig,
     beam_angle: float,
-) -> np.ndarray:
+) -> tuple[np.ndarray, float]:
     """Moves the far end of a box to where all points inside say that it is, as far as the sensor sees it.
 
     Args:
@@ -162,18 +170,18 @@ def end_where_seen(
       beam_angle: rad, between neighbouring beams: an azimuth cell of the evidence.
 
     Returns:
-      (5,) the box with the same near end.
+      The box (5,) with the same near end; how sure it is that the end is seen, in [0, 1].
     """
     along, across = sensor_outside(box)
     view = np.arctan2(across, along)
     weight = min(np.tan(min(view, 1.5)) / float(config.end_slope), 1.0)
-    weight *= np.interp(around.deepest / usual_m - float(config.end_length), [0, SEEN_RAMP], [0, 1])
+    weight *= share_seen(around.deepest, usual_m, config.end_length)
     weight *= around.num_inside / (around.num_inside + float(config.end_points))
     # Beams that meet the side at that angle, so far away, are so far apart on it.
     spacing_m = beam_angle * np.hypot(along, across) / np.sin(view) if view > 0 else np.inf
     length = box[2] + weight * (around.deepest + min(spacing_m / 2, MAX_END_MARGIN_M) - box[2])
     facing = np.sign(in_box_frame(np.zeros(2), box)[0]) * np.array([np.cos(box[4]), np.sin(box[4])])
-    return np.array([*(box[:2] + facing * (box[2] - length) / 2), length, *box[3:]])
+    return np.array([*(box[:2] + facing * (box[2] - length) / 2), length, *box[3:]]), float(weight)
 
 
 def score_box(

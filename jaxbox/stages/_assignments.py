@@ -72,6 +72,20 @@ def fits(sides: Assignments, prior: ClassPrior) -> jax.Array:
     return (length <= prior.max_length_m) & (width <= prior.max_width_m)
 
 
+def share_seen(measured: jax.Array, usual: jax.Array | float, seen: jax.Array | float) -> jax.Array:
+    """How sure it is that a side is seen whole.
+
+    Args:
+      measured: (...) float32, m, how much of it shows.
+      usual: m, size of the class.
+      seen: fraction of that from which on it may be seen whole.
+
+    Returns:
+      (...) float32, from 0 where it may be hidden in part to 1.
+    """
+    return jnp.clip((measured / usual - seen) / SEEN_RAMP, 0, 1)
+
+
 def likely_sizes(
     sides: Assignments, prior: ClassPrior, config: CompletionConfig
 ) -> tuple[jax.Array, jax.Array]:
@@ -95,7 +109,7 @@ def likely_sizes(
         seen: jax.Array | float,
         margin_m: jax.Array | float,
     ) -> jax.Array:
-        whole = jnp.clip((measured / usual - seen) / SEEN_RAMP, 0, 1)
+        whole = share_seen(measured, usual, seen)
         return jnp.maximum(usual + config.seen_weight * whole * (measured + margin_m - usual), measured)
 
     length, width = sides.measured

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, VehicleConfig
 from jaxbox.geometry.planar import rectangle_iou, wrap_yaw
-from jaxbox.stages._assignments import SEEN_RAMP
+from jaxbox.stages._assignments import share_seen
 from jaxbox.stages._priors import asymmetric_gaussian, closed_free_length, prior_of, size_score
 from jaxbox.stages._rows import hit_share
 from jaxbox.stages._surroundings import cluster_alone, count_points_around, sensor_from
@@ -91,22 +91,24 @@ def score_boxes(
         size = jnp.stack([box.length, box.width, wrap_yaw(box.yaw)], axis=1)
         rectangle = jnp.concatenate([box.center, size], axis=1)
         of_hypothesis = take(hypotheses.label, chosen), take(hypotheses.cluster, chosen)
-        return rectangle, *of_hypothesis, take(score, chosen), box.measured[:, 1], box.in_row
+        return rectangle, *of_hypothesis, take(score, chosen), box.measured, box.in_row
 
     picked = map_rows(pick, chosen, num_rows=num)
     rectangle, label, cluster, early, *_ = picked
     around = _look_around(rectangle, label, cluster, early, num, clusters, obstacles, config)
 
     def finish(rows: tuple[Any, ...]) -> Candidates:
-        rectangle, label, cluster, *others, in_row, around = rows
+        rectangle, label, cluster, score, measured, in_row, around = rows
         if config.vehicles.neighbourhood and config.completion.mode != "none":
-            ended = _end_where_seen(rectangle, label, around, config)
+            ended, seen = _end_where_seen(rectangle, label, measured[:, 0], around, config)
             rectangle = jnp.where(in_row[:, None], rectangle, ended)
+            score = score * (seen + settings.hidden_length_score * (1 - seen))
         z = jnp.zeros_like(rectangle[:, 0]) if lowest_z is None else take(lowest_z, cluster)
         ground = ground_elevation(jnp.concatenate([rectangle[:, :2], z[:, None]], axis=1))
         nearest = jnp.hypot(*_distances_outside(rectangle))
         reach = NOT_CUT_M * jnp.ones_like(ground) if steepest is None else steepest * nearest - ground
-        candidates = _finish((rectangle, label, cluster, *others, around), reach, clusters, settings)
+        row = rectangle, label, cluster, score, measured[:, 1], around
+        candidates = _finish(row, reach, clusters, settings)
         return dataclasses.replace(candidates, bottom=candidates.bottom + ground)
 
     # Many at a time where they are looked up in the ground grid, see `map_rows`.
@@ -174,11 +176,17 @@ def _distances_outside(rectangles: jax.Array) -> list[jax.Array]:
 
 
 def _end_where_seen(
-    rectangles: jax.Array, label: jax.Array, around: NeighbourhoodCounts, config: DetectorConfig
-) -> jax.Array:
+    rectangles: jax.Array,
+    label: jax.Array,
+    measured_m: jax.Array,
+    around: NeighbourhoodCounts,
+    config: DetectorConfig,
+) -> tuple[jax.Array, jax.Array]:
+    """The rectangles (P, 5) with their ends where they are seen, and how sure their length is (P,)."""
     usual_m = prior_of(config.vehicles.classes, label).length_m
     beam_angle = 2 * math.pi / config.evidence.num_azimuths
-    return end_where_seen(rectangles, around, usual_m, config.completion, beam_angle)
+    ended, seen = end_where_seen(rectangles, around, usual_m, config.completion, beam_angle)
+    return ended, jnp.maximum(seen, share_seen(measured_m, usual_m, config.completion.seen_length))
 
 
 def _finish(rows: tuple[Any, ...], reach: jax.Array, clusters: Clusters, config: VehicleConfig) -> Candidates:
@@ -265,7 +273,7 @@ def end_where_seen(
     usual_m: jax.Array | float,
     config: CompletionConfig,
     beam_angle: float,
-) -> jax.Array:
+) -> tuple[jax.Array, jax.Array]:
     """Moves the far end of boxes to where all points inside say that it is, as far as the sensor sees it.
 
     The sides of a box are fitted to a sample of the points of one cluster, which seldom holds the far end:
@@ -281,20 +289,23 @@ def end_where_seen(
       beam_angle: rad, between neighbouring beams: an azimuth cell of the evidence.
 
     Returns:
-      (P, 5) float32: the near ends stay.
+      boxes: (P, 5) float32: the near ends stay.
+      seen: (P,) float32, in [0, 1]: how sure it is that the end is seen.
 
     Reference: oracle `jaxbox.reference.end_where_seen`.
     """
     x, y, length, width, yaw = rectangles.T
     along, across = _distances_outside(rectangles)
     steep = jnp.minimum(across / jnp.maximum(along, 1e-3) / config.end_slope, 1)
-    whole = jnp.clip((around.deepest / usual_m - config.end_length) / SEEN_RAMP, 0, 1)
+    whole = share_seen(around.deepest, usual_m, config.end_length)
     dense = around.num_inside / (around.num_inside + config.end_points)
     spacing_m = beam_angle * (along**2 + across**2) / jnp.maximum(across, 1e-3)
     seen_m = around.deepest + jnp.minimum(spacing_m / 2, MAX_END_MARGIN_M)
-    answered = length + steep * whole * dense * (seen_m - length)
+    sure = steep * whole * dense
+    answered = length + sure * (seen_m - length)
     shift = jnp.sign(sensor_from(rectangles)[0]) * (length - answered) / 2
-    return jnp.stack([x + shift * jnp.cos(yaw), y + shift * jnp.sin(yaw), answered, width, yaw], axis=1)
+    ended = jnp.stack([x + shift * jnp.cos(yaw), y + shift * jnp.sin(yaw), answered, width, yaw], axis=1)
+    return ended, sure
 
 
 def neighbourhood_score(
