@@ -22,7 +22,7 @@ from benchmarks import common
 from jaxbox import DetectorConfig
 from jaxbox.evaluation import Selection, kitti, report
 from jaxbox.evaluation.copies import COPIES, Copy, Frame, detect_copy, label_points, read_frame
-from jaxbox.io import KittiObject, open_sweeps, read_drives
+from jaxbox.io import KittiObject, find_drives, open_sweeps, read_drives
 
 METRICS = ("bev", "3d")
 RECALLS = (("bev", 0.5), ("bev", 0.7), ("3d", 0.7))
@@ -152,11 +152,9 @@ def drives_of(options: argparse.Namespace, frames: Sequence[Frame]) -> dict[str,
     names = [frame.name for frame in frames]
     if options.drives is not None:
         return read_drives(options.drives, names)
-    files = [common.data_folder(name) / "drives.txt" for name in options.data]
-    if not all(file.is_file() for file in files):
-        return None
-    rows = [line.split("#")[0].split() for file in files for line in file.read_text().splitlines()]
-    return {row[0]: row[1] for row in rows if row and row[0] in set(names)}
+    files = [find_drives(common.data_folder(name)) for name in options.data]
+    found = [file for file in files if file is not None]
+    return read_drives(found, names) if len(found) == len(files) else None
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import shutil
 
 import pytest
 from typer.testing import CliRunner
@@ -10,8 +11,15 @@ from typer.testing import CliRunner
 import jaxbox
 from jaxbox import synthetic
 from jaxbox.cli import app
-from jaxbox.cli.tune import time_left
-from jaxbox.io import objects_from_detections, read_config, write_bin, write_calibration, write_labels
+from jaxbox.cli.tune import frame_groups, time_left
+from jaxbox.io import (
+    objects_from_detections,
+    open_sweeps,
+    read_config,
+    write_bin,
+    write_calibration,
+    write_labels,
+)
 from jaxbox.run.compiled import count_compilations
 from jaxbox.tuning import Bench, Trial
 from jaxbox.types import PointCloud
@@ -79,6 +87,8 @@ def test_a_wrong_base_is_told_from_a_better_setting_on_drives_left_out(kitti_fol
     assert [row["group"] for row in report["held_out"]["groups"]] == ["drive_0", "drive_1", "drive_2"]
     assert not report["held_out"]["keep_base"]
     assert f"Take trial {report['best']['trial']}" in result.stdout
+    headline = f"Leave one drive out: {report['held_out']['mean']:.2f}"
+    assert (output / "report.md").read_text().splitlines()[2].startswith(headline)
     assert f"Take trial {report['best']['trial']}" in (output / "report.md").read_text()
     best = json.loads((output / "best.json").read_text())
     assert best == {"preset": "default"} | report["best"]["changes"]
@@ -124,6 +134,32 @@ def test_without_drives_each_sweep_is_left_out_and_the_report_says_so(kitti_fold
     for text in (result.stdout, (tmp_path / "tune" / "report.md").read_text()):
         assert "No drives were given" in text
         assert "Keep the base" in text
+
+
+def test_several_folders_are_pooled_and_grouped_by_the_drives_beside_them(kitti_folder, tmp_path):
+    names = [f"{seed:06d}" for seed in range(NUM_SWEEPS)]
+    for root, chosen in (("one", names[:1]), ("two", names[1:])):
+        for folder, suffix in (("velodyne", "bin"), ("calib", "txt"), ("label_2", "txt")):
+            (tmp_path / root / "training" / folder).mkdir(parents=True)
+            for name in chosen:
+                file = f"{folder}/{name}.{suffix}"
+                shutil.copy(kitti_folder / file, tmp_path / root / "training" / file)
+        (tmp_path / root / "drives.txt").write_text("".join(f"{name} drive_{root} 5\n" for name in chosen))
+    both = ("--labels", tmp_path / "one")
+    result = tune(tmp_path / "two" / "training", tmp_path / "tune", "--trials", 1, *both)
+    assert result.exit_code == 0, result.output
+    report = read_report(tmp_path / "tune")
+    assert (report["num_frames"], report["group_kind"]) == (NUM_SWEEPS, "drive")
+    rows = {row["group"]: row["num_frames"] for row in report["held_out"]["groups"]}
+    assert rows == {"drive_one": 1, "drive_two": NUM_SWEEPS - 1}
+    (tmp_path / "one" / "drives.txt").unlink()
+    refused = tune(tmp_path / "two", tmp_path / "none", *both)
+    assert refused.exit_code == 2
+    assert "no drive for 1 of 3 frames" in refused.stderr
+    (tmp_path / "two" / "drives.txt").unlink()
+    kind, groups = frame_groups(open_sweeps([tmp_path / "one", tmp_path / "two"]), names, [])
+    assert kind == "folder"
+    assert groups[names[0]] != groups[names[1]] == groups[names[2]]
 
 
 def interrupt_at(monkeypatch, index):

@@ -103,6 +103,20 @@ def test_a_gain_within_its_spread_over_the_copies_is_noise():
     assert small.keep_base
 
 
+def test_a_gain_that_hangs_on_one_drive_is_noise():
+    gain = [27, 27, 0, 0, 0]
+    base = trial(0, [50] * 5)
+    uneven = leave_one_out([base, trial(1, np.add(50, gain))], GROUPS, mean)
+    even = leave_one_out([base, trial(1, [50 + np.mean(gain)] * 5)], GROUPS, mean)
+    assert even.group_spread == pytest.approx(0)
+    assert even.gain > even.noise == NOISE
+    # Without the drive that gains, the base is as good and stands for it.
+    assert uneven.gain == pytest.approx(0)
+    both = leave_one_out([base, trial(1, np.add(51, gain))], GROUPS, mean)
+    assert both.gain == pytest.approx(even.gain + 1)
+    assert both.noise == both.group_spread > 5
+
+
 def test_one_drive_cannot_be_left_out():
     groups = dict.fromkeys(GROUPS, "north")
     assert leave_one_out([trial(0, [50] * 5, groups=groups)], groups, mean) is None

@@ -24,7 +24,6 @@ from jaxbox.cli.options import (
     CapacityOption,
     ColumnsOption,
     CropsOption,
-    DrivesOption,
     Engine,
     EngineOption,
     FlipOption,
@@ -270,7 +269,10 @@ app.command("eval", epilog=EXIT_CODES)(evaluate)
 def tune(
     *,
     labels: Annotated[
-        pathlib.Path, typer.Option(help="A labelled KITTI folder, or that of an annotation tool.")
+        list[pathlib.Path],
+        typer.Option(
+            help="A labelled KITTI folder, or that of an annotation tool; repeat it to pool several."
+        ),
     ],
     output: Annotated[pathlib.Path, typer.Option(help="Folder for the report and the best settings.")],
     search: Annotated[
@@ -288,7 +290,13 @@ def tune(
         int, typer.Option(min=1, max=len(COPIES), help="Turned and mirrored copies of each sweep.")
     ] = 4,
     objective: Annotated[str, typer.Option(help=f"One of {', '.join(OBJECTIVES)}; moderate R40.")] = "soft",
-    drives: DrivesOption = None,
+    drives: Annotated[
+        pathlib.Path | None,
+        typer.Option(
+            help='Text file of the drive of each frame: "frame drive" a line. Without it, drives.txt in or '
+            "beside each labelled folder."
+        ),
+    ] = None,
     preset: PresetOption = None,
     sensor: SensorOption = None,
     settings: SettingsOption = None,

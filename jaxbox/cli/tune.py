@@ -17,9 +17,18 @@ from jaxbox.cli.console import ExitCode, exit_code, make_progress, print_error
 from jaxbox.cli.report import make_table
 from jaxbox.config import DetectorConfig
 from jaxbox.config.fields import PRESET_KEY, changed_fields
-from jaxbox.evaluation.copies import COPIES, Frame, read_frame
+from jaxbox.evaluation.copies import COPIES, read_frame
 from jaxbox.evaluation.objectives import OBJECTIVES
-from jaxbox.io import InputError, PointConvention, atomic_writer, open_sweeps, read_drives
+from jaxbox.io import (
+    InputError,
+    PointConvention,
+    Sweep,
+    atomic_writer,
+    find_drives,
+    group_sequences,
+    open_sweeps,
+    read_drives,
+)
 from jaxbox.run.compiled import count_compilations
 from jaxbox.tuning import Axis, Bench, Trial
 
@@ -45,20 +54,20 @@ class TuneOptions:
     objective: str
     """Name in `OBJECTIVES`."""
     drives: pathlib.Path | None
-    """File with the drive of each frame."""
+    """File with the drive of each frame; None for the ``drives.txt`` beside the labels."""
     convention: PointConvention
     """How the numbers of the points are to be taken."""
     seed: int
     """Of the settings that are tried."""
 
 
-def run_tune(labels: pathlib.Path, options: TuneOptions, console: Console) -> ExitCode:
+def run_tune(labels: Sequence[pathlib.Path], options: TuneOptions, console: Console) -> ExitCode:
     """Tries settings, reports, and writes report.json, report.md, best.json and trials.csv.
 
     Interrupted, it reports the trials that are done.
 
     Args:
-      labels: folder of labelled sweeps.
+      labels: folders of labelled sweeps, pooled.
       options: the command's options.
       console: where results go.
 
@@ -98,7 +107,7 @@ def run_tune(labels: pathlib.Path, options: TuneOptions, console: Console) -> Ex
         "num_planned": options.trials,
         "preset": options.preset,
         "base_changes": changed_fields(options.config, DetectorConfig.presets()[options.preset]),
-        "drives": None if options.drives is None else options.drives.name,
+        "drives": [str(file) for file in drive_files(labels, options.drives)],
         "seed": options.seed,
         "compile_s": compile_s,
         "num_compilations": count_compilations() - compiled_before,
@@ -139,7 +148,7 @@ def chosen_axes(options: TuneOptions) -> list[Axis]:
     return axes
 
 
-def make_bench(labels: pathlib.Path, options: TuneOptions) -> Bench:
+def make_bench(labels: Sequence[pathlib.Path], options: TuneOptions) -> Bench:
     """Reads the labelled sweeps, and the groups in which they are held out.
 
     Raises:
@@ -149,20 +158,60 @@ def make_bench(labels: pathlib.Path, options: TuneOptions) -> Bench:
     frames = [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
     if not frames:
         raise InputError(
-            f"{labels}: no sweep there has labels and a calibration; give a labelled KITTI folder."
+            f"{', '.join(map(str, labels))}: no sweep there has labels and a calibration; give a labelled "
+            "KITTI folder."
         )
+    kind, groups = frame_groups(sweeps, [frame.name for frame in frames], drive_files(labels, options.drives))
     return Bench(
         base=options.config,
         frames=frames,
-        groups=_groups(frames, options.drives),
+        groups=groups,
+        group_kind=kind,
         copies=COPIES[: options.copies],
         objective=OBJECTIVES[options.objective],
     )
 
 
-def _groups(frames: Sequence[Frame], drives: pathlib.Path | None) -> dict[str, str]:
-    names = [frame.name for frame in frames]
-    return {name: name for name in names} if drives is None else read_drives(drives, names)
+def drive_files(labels: Sequence[pathlib.Path], given: pathlib.Path | None) -> list[pathlib.Path]:
+    """The files that say which drive a frame is of.
+
+    Args:
+      labels: folders of labelled sweeps.
+      given: the file that the user named, or None.
+
+    Returns:
+      That file; else the ``drives.txt`` in or beside each of the folders that has one.
+    """
+    if given is not None:
+        return [given]
+    return list(dict.fromkeys(file for folder in labels if (file := find_drives(folder)) is not None))
+
+
+def frame_groups(
+    sweeps: Sequence[Sweep], names: Sequence[str], files: Sequence[pathlib.Path]
+) -> tuple[str, dict[str, str]]:
+    """What is held out together: drives as files say them, else the sweeps of one folder or recording.
+
+    Args:
+      sweeps: all sweeps.
+      names: those of them that have labels.
+      files: from `drive_files`.
+
+    Returns:
+      What a group is, in a word, and the group of each frame. Where all sweeps lie in one folder and no file
+      says their drives, each sweep is a group.
+
+    Raises:
+      InputError: where there are files and one of the frames has no drive in them.
+    """
+    if files:
+        return "drive", read_drives(files, names)
+    sequences = group_sequences(sweeps)
+    folder_of = {sweep.name: name for name, sequence in sequences for sweep in sequence}
+    folders = {name: folder_of[name] for name in names}
+    if len(set(folders.values())) > 1:
+        return "folder", folders
+    return "sweep", {name: name for name in names}
 
 
 def run_trials(
@@ -237,12 +286,12 @@ def run_notes(report: dict[str, Any]) -> list[str]:
     """Sentences on how the search was run."""
     done, planned = len(report["trials"]), report["num_planned"]
     ended = "interrupted; " if report["interrupted"] else ""
-    groups = (
-        "No drives were given, so each sweep was held out by itself: sweeps of a drive resemble each other, "
-        "and the held-out figures are flattered."
-        if report["drives"] is None
-        else f"Groups are the drives of {report['drives']}."
-    )
+    groups = {
+        "drive": f"Drives are those of {', '.join(report['drives'])}.",
+        "folder": "No file says which drive a frame is of, so each folder or recording is taken for one.",
+        "sweep": "No drives were given, so each sweep was held out by itself: sweeps of a drive resemble "
+        "each other, and the held-out figures are flattered.",
+    }[report["group_kind"]]
     return [
         f"{done} of {planned} trials ({ended}seed {report['seed']}), "
         f"median {report['seconds_per_trial']:.1f} s a trial.",

@@ -10,7 +10,7 @@ from jaxbox.io.argoverse2 import (
 )
 from jaxbox.io.config import read_config, write_config
 from jaxbox.io.convention import AXES, ORDINARY, PointConvention
-from jaxbox.io.drives import read_drives
+from jaxbox.io.drives import find_drives, read_drives
 from jaxbox.io.images import read_image
 from jaxbox.io.jsonl import detections_record, read_jsonl, tracks_record, write_jsonl
 from jaxbox.io.kitti import (
@@ -74,6 +74,7 @@ __all__ = [
     "atomic_writer",
     "boxes_from_objects",
     "detections_record",
+    "find_drives",
     "find_poses",
     "group_sequences",
     "measure_sweeps",

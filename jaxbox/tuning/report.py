@@ -35,6 +35,7 @@ def make_report(bench: Bench, axes: Sequence[Axis], trials: Sequence[Trial[Match
         "objective": bench.objective.title,
         "num_frames": len(bench.frames),
         "num_groups": len(set(bench.groups.values())),
+        "group_kind": bench.group_kind,
         "ceiling": ceiling,
         "capacity": bench.capacity,
         "copies": [copy.name for copy in bench.copies],
@@ -71,6 +72,7 @@ def _held_out_row(
         "sd": _spread(held_out.scores),
         "gain": held_out.gain,
         "gain_spread": held_out.spread,
+        "gain_spread_over_groups": held_out.group_spread,
         "noise": held_out.noise,
         "keep_base": held_out.keep_base,
         "times_chosen": {str(index): times for index, times in held_out.times_chosen.items()},
@@ -93,7 +95,7 @@ def _spread(scores: Sequence[float]) -> float | None:
 
 
 def report_sentences(report: Mapping[str, Any]) -> list[str]:
-    """What to conclude, the advice last.
+    """What to conclude: the held-out figure first, the advice last.
 
     Args:
       report: from `make_report`.
@@ -101,21 +103,18 @@ def report_sentences(report: Mapping[str, Any]) -> list[str]:
     Returns:
       A few sentences.
     """
-    base, best, held_out = report["base"], report["best"], report["held_out"]
+    base, best, held_out, kind = report["base"], report["best"], report["held_out"], report["group_kind"]
     lines = [
-        f"Objective: {report['objective']}, mean over the copies "
-        f"({', '.join(report['copies'])}) of {report['num_frames']} frames in {report['num_groups']} groups; "
-        f"perfect answers reach {report['ceiling']:.2f}.",
-        f"Base {_mean(base)}; best in sample {_mean(best)}, trial {best['trial']}: flattered, as it was "
-        "chosen on the frames that it is scored on.",
+        f"Objective: {report['objective']}, mean over the copies ({', '.join(report['copies'])}) of "
+        f"{_counted(report['num_frames'], 'frame')} of {_counted(report['num_groups'], kind)}; perfect "
+        f"answers reach {report['ceiling']:.2f}.",
+        f"Best in sample {_mean(best)}, trial {best['trial']}: flattered, as it was chosen on the frames "
+        "that it is scored on.",
     ]
     if held_out is None:
-        return [*lines, "Keep the base: with one group nothing can be held out, so the gain is unproven."]
-    spread = held_out["gain_spread"]
-    lines.append(
-        f"Held out {_mean(held_out)}: each group with the setting that the others chose, a gain of "
-        f"{held_out['gain']:+.2f} (spread over the copies {_number(spread)}; at least {NOISE:g} is noise)."
-    )
+        base_line = f"Base {_mean(base)}; with one {kind} nothing can be held out."
+        return [base_line, *lines, "Keep the base: the gain is unproven."]
+    lines.insert(0, _headline(base, held_out, kind))
     if best["trial"] == 0:
         return [*lines, "Keep the base: no setting that was tried is better."]
     if held_out["keep_base"]:
@@ -127,6 +126,19 @@ def report_sentences(report: Mapping[str, Any]) -> list[str]:
     if not best["blind"]:
         chosen += " It was refined by all labels; what refining added is not in the held-out gain."
     return [*lines, chosen]
+
+
+def _headline(base: Mapping[str, Any], held_out: Mapping[str, Any], kind: str) -> str:
+    return (
+        f"Leave one {kind} out: {_mean(held_out)}, each {kind} with the setting that the others chose; the "
+        f"base {_mean(base)}, a gain of {held_out['gain']:+.2f} (spread over the copies "
+        f"{_number(held_out['gain_spread'])}, over {kind}s drawn again "
+        f"{_number(held_out['gain_spread_over_groups'])}; at least {NOISE:g} is noise)."
+    )
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def report_tables(report: Mapping[str, Any]) -> list[Table]:
@@ -143,7 +155,7 @@ def report_tables(report: Mapping[str, Any]) -> list[Table]:
 
 
 def _copies_table(report: Mapping[str, Any]) -> Table:
-    named = [("base", report["base"]), ("best in sample", report["best"]), ("held out", report["held_out"])]
+    named = [("held out", report["held_out"]), ("base", report["base"]), ("best in sample", report["best"])]
     rows = [
         [name, *(f"{score:.2f}" for score in row["scores"]), f"{row['mean']:.2f}", _number(row["sd"])]
         for name, row in named
@@ -205,8 +217,9 @@ def _groups_table(report: Mapping[str, Any]) -> Table:
         ]
         for row in report["held_out"]["groups"]
     ]
-    title = "each group by itself, held out; the ceiling is what perfect answers reach"
-    return title, ["group", "frames", "trial chosen without it", "base", "held out", "gain", "ceiling"], rows
+    kind = report["group_kind"]
+    title = f"each {kind} by itself, held out; the ceiling is what perfect answers reach"
+    return title, [kind, "frames", "trial chosen without it", "base", "held out", "gain", "ceiling"], rows
 
 
 def markdown_report(report: Mapping[str, Any], *, title: str, notes: Sequence[str]) -> str:

@@ -19,6 +19,8 @@ Match = TypeVar("Match")
 
 NOISE = 1.0
 """Points of the objective that turning the sweeps alone can move; smaller gains are not evidence."""
+NUM_DRAWS = 50
+"""Of the groups, with replacement (bootstrap), to say how much a gain hangs on which drives there are."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,6 +62,8 @@ class HeldOut:
     """For each copy, the base over all frames."""
     group_scores: Mapping[str, tuple[float, float]]
     """For each group by itself, mean over the copies: the base, and the setting chosen without it."""
+    group_spread: float
+    """Standard deviation of the gain over groups that are drawn again with replacement."""
 
     @property
     def times_chosen(self) -> dict[int, int]:
@@ -79,8 +83,8 @@ class HeldOut:
 
     @property
     def noise(self) -> float:
-        """The gain must exceed this: its spread, and at least `NOISE`."""
-        return max(NOISE, self.spread or 0.0)
+        """The gain must exceed this: its spreads over copies and groups, and at least `NOISE`."""
+        return max(NOISE, self.spread or 0.0, self.group_spread)
 
     @property
     def keep_base(self) -> bool:
@@ -146,7 +150,38 @@ def leave_one_out(
         name: (_group_mean(trials[0], frames, score), _group_mean(blind[chosen[name]], frames, score))
         for name, frames in members.items()
     }
-    return HeldOut(chosen=chosen, scores=scores, base_scores=trials[0].scores, group_scores=group_scores)
+    held_out = {name: blind[chosen[name]] for name in names}
+    return HeldOut(
+        chosen=chosen,
+        scores=scores,
+        base_scores=trials[0].scores,
+        group_scores=group_scores,
+        group_spread=_group_spread(trials[0], held_out, members, score),
+    )
+
+
+def _group_spread(
+    base: Trial[Match],
+    held_out: Mapping[str, Trial[Match]],
+    members: Mapping[str, Sequence[str]],
+    score: Callable[[Iterable[Match]], float],
+) -> float:
+    """Standard deviation of the gain over the groups drawn again: both settings see the same draw."""
+    if all(trial is base for trial in held_out.values()):
+        return 0.0
+    random = np.random.default_rng(0)
+    gains = []
+    for _ in range(NUM_DRAWS):
+        drawn = random.choice(sorted(members), len(members))
+        frames = [(name, frame) for name in drawn for frame in members[name]]
+        gains.append(
+            [
+                score(held_out[name].matches[copy][frame] for name, frame in frames)
+                - score(base.matches[copy][frame] for _, frame in frames)
+                for copy in range(len(base.matches))
+            ]
+        )
+    return float(np.std(np.mean(gains, axis=1)))
 
 
 def _members(groups: Mapping[str, str]) -> dict[str, list[str]]:

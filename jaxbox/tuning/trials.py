@@ -36,6 +36,8 @@ class Bench:
     """How the sweeps are turned."""
     objective: Objective
     """What a good setting is."""
+    group_kind: str = "drive"
+    """What a group is, in a word: "drive", "folder" or "sweep"."""
 
     @property
     def capacity(self) -> int:
