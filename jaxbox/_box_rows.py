@@ -5,7 +5,7 @@ it waits for the arrays, and counts the rows that are valid.
 """
 
 import importlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Generic, Self, TypeVar, overload
 
 import jax
@@ -20,6 +20,8 @@ from jaxbox.geometry.rigid import rotation_about_z
 AnyBox = TypeVar("AnyBox", bound=Box)
 AnyRows = TypeVar("AnyRows", bound="BoxRows[Any]")
 
+ScoreByClass = Mapping[Label, float] | Mapping[str, float]
+"""By class, or by a name as `Label.word`."""
 MAX_LISTED = 6
 """Boxes that a text lists, the first ones."""
 MIN_CORNERS = 3
@@ -94,9 +96,21 @@ class BoxRows(ByValue, Generic[AnyBox]):
         rows = _chosen_rows(np.asarray(host.valid), index)
         return host._box_at(int(rows)) if np.ndim(rows) == 0 else host._with_rows(rows)
 
-    def above(self, score: float) -> Self:
-        """The boxes of at least that score, such as `jaxbox.DEFAULT_SCORE_THRESHOLD`."""
-        return self[np.asarray(_one_sweep(self).score) >= score]
+    def above(self, score: float | ScoreByClass) -> Self:
+        """The boxes of at least that score, such as `jaxbox.DEFAULT_SCORE_THRESHOLD`.
+
+        Args:
+          score: of all classes; or by class, such as ``{"car": 0.15, "van": 0.2}``, where classes that are
+            not named keep all their boxes.
+
+        Returns:
+          Those boxes.
+
+        Raises:
+          ValueError: for an unknown class, naming the known ones.
+        """
+        host = _one_sweep(self)
+        return self[reaches(host.score, host.label, score)]
 
     def of(self, *labels: Label | str) -> Self:
         """The boxes of some classes.
@@ -295,6 +309,28 @@ def _label(label: Label | str) -> Label:
             return known
     words = ", ".join(f'"{known.word}"' for known in Label)
     raise ValueError(f"{label!r} is not a class; choose one of {words}.")
+
+
+def reaches(score: Any, label: Any, least: float | ScoreByClass) -> np.ndarray:
+    """Which boxes score enough.
+
+    Args:
+      score: (n,) float.
+      label: (n,) int, `Label`.
+      least: the score of all classes, or of some.
+
+    Returns:
+      (n,) bool.
+
+    Raises:
+      ValueError: for an unknown class.
+    """
+    score = np.asarray(score)
+    if not isinstance(least, Mapping):
+        return score >= least
+    known = {_label(name): value for name, value in least.items()}
+    table = np.array([known.get(each, -np.inf) for each in Label], score.dtype)
+    return score >= table[np.asarray(label)]
 
 
 def in_polygon(center: np.ndarray, polygon: Any) -> np.ndarray:

@@ -174,6 +174,11 @@ def test_filters_choose_boxes_are_recorded_and_held_by_resume(sweeps, written, t
     common = (sweeps / "a.bin", "--format", "jsonl", "--classes", "vans,car", "--min-score", "0.005")
     found = jaxbox.detect(io.read_points(sweeps / "a.bin")[0], DetectorConfig())
     whole = records_of(written[0])[0]["boxes"]
+    by_class = "--format", "jsonl", "--min-score", "0.005,car=0.3"
+    assert detect(tmp_path / "by_class", sweeps / "a.bin", *by_class).exit_code == 0
+    of_class = found.above({"car": 0.3, "van": 0.005, "truck": 0.005})
+    boxes = records_of(tmp_path / "by_class")[0]["boxes"]
+    np.testing.assert_array_equal([box["score"] for box in boxes], of_class.score)
     for name, area in (("rectangle", "-10,30,-10.5,10"), ("polygon", tmp_path / "area.txt")):
         output = tmp_path / name
         assert detect(output, *common, "--within", area).exit_code == 0

@@ -689,6 +689,7 @@ def test_what_the_workers_cannot_do_for_drives_is_refused(drives, tmp_path):
         (("--engine", "ray", "--no-points"), "--points and --no-points: the workers"),
         (("--engine", "ray", "--coasting"), "--coasting: the workers"),
         (("--engine", "ray", "--level"), "--level: the workers"),
+        (("--engine", "ray", "--min-score", "0.1,van=0.2"), "--min-score by class: the workers"),
         (("--engine", "ray", "--sensor-at", "0", "0", "1"), "--sensor-at: the workers"),
         (("--engine", "ray", "--axes", "enu"), "--scale, --axes, --flip and --columns: the workers"),
         (("--engine", "ray", "--poses", "nowhere.txt"), "nowhere.txt: no such file or folder of poses"),

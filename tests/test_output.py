@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxbox import io
-from jaxbox.cli.box_filter import BoxFilter
+from jaxbox.cli.box_filter import BoxFilter, parse_min_score
 from jaxbox.cli.run_sheet import NUM_COLUMNS, NUM_TILES, SHEET_NAME, RunSheet
 from jaxbox.io import InputError
 from jaxbox.io.csv_table import CSV, open_csv
@@ -39,6 +39,30 @@ def test_a_filter_that_cannot_be_says_so(options, words):
     with pytest.raises(InputError) as error:
         BoxFilter.chosen(**{"classes": None, "within": None, **options})
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("2", "'2' is no score from 0 to 1"),
+        ("nan", "'nan' is no score"),
+        ("car", "'car' is no score"),
+        ("car=", "'' is no score"),
+        ("bus=0.5", "'bus' is no class; choose from car, van, truck"),
+        ("car=0.5,cars=0.4", "'cars=0.4' says again"),
+        ("0.1,0.2", "'0.2' says again"),
+    ],
+)
+def test_a_least_score_that_cannot_be_says_so(text, words):
+    with pytest.raises(InputError) as error:
+        parse_min_score(text)
+    assert f"--min-score {text}: " in str(error.value)
+    assert words in str(error.value)
+
+
+def test_a_class_that_is_named_may_have_a_lower_score_than_the_others():
+    assert parse_min_score("0.3, Cars = 0.1") == (0.1, {"car": 0.1, "van": 0.3, "truck": 0.3})
+    assert parse_min_score("van=0.2") == (0.0, {"car": 0.0, "van": 0.2, "truck": 0.0})
 
 
 @pytest.mark.parametrize(

@@ -136,6 +136,12 @@ def test_filters_keep_what_they_say(found):
     assert list(found.of("car", "van", "truck")) == every
     with pytest.raises(ValueError, match='"car", "van", "truck"'):
         found.of("bicycle")
+    by_class = found.above({"cars": cut, Label.VAN.word: 2.0})
+    assert list(by_class) == [
+        box for box in every if box.label is Label.TRUCK or (box.label is Label.CAR and box.score >= cut)
+    ]
+    with pytest.raises(ValueError, match="'bus' is not a class"):
+        found.above({"bus": 0.5})
 
 
 def test_boxes_within_a_region_or_a_polygon_are_those_whose_centres_are(found):

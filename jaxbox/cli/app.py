@@ -7,7 +7,13 @@ import typer
 
 from jaxbox._loopback import LOOPBACK
 from jaxbox._version import __version__
-from jaxbox.cli.box_filter import BoxFilter, ClassesOption, WithinOption
+from jaxbox.cli.box_filter import (
+    MIN_SCORE_METAVAR,
+    BoxFilter,
+    ClassesOption,
+    WithinOption,
+    parse_min_score,
+)
 from jaxbox.cli.config_options import chosen_config, chosen_preset
 from jaxbox.cli.console import cache_warnings, input_errors, stdout
 from jaxbox.cli.demo import run_demo
@@ -153,14 +159,13 @@ def detect(
     columns: ColumnsOption = None,
     capacity: CapacityOption = None,
     min_score: Annotated[
-        float,
+        str,
         typer.Option(
-            min=0.0,
-            max=1.0,
-            help="Leave out lower scores. 0 keeps all, as `eval` wants it; "
+            metavar=MIN_SCORE_METAVAR,
+            help="Leave out lower scores, of all or by class. 0 keeps all, as `eval` wants it; "
             f"pictures and counts never show less than {SHOWN_MIN_SCORE:g}.",
         ),
-    ] = 0.0,
+    ] = "0",
     classes: ClassesOption = None,
     within: WithinOption = None,
     points: Annotated[
@@ -209,11 +214,12 @@ def detect(
     """
     with input_errors():
         config = chosen_config(preset, settings, changes or [], sensor=sensor)
-        keep = BoxFilter.chosen(classes=classes, within=within)
+        least, by_class = parse_min_score(min_score)
+        keep = BoxFilter.chosen(classes=classes, within=within, min_scores=by_class)
         convention = PointConvention(scale, axes, flip, columns)
         if engine is Engine.RAY:
             kept, drawn = (
-                {"--classes": classes, "--within": within},
+                {"--classes": classes, "--within": within, "--min-score by class": by_class},
                 {"--pictures": pictures, "--crops": crops},
             )
             other = kept | drawn | {"--level": level, "--sensor-at": sensor_at}
@@ -226,7 +232,7 @@ def detect(
                 sweeps_per_partition=sweeps_per_partition or SWEEPS_PER_PARTITION,
                 topic=topic,
                 capacity=capacity,
-                min_score=min_score,
+                min_score=least,
                 resume=resume,
                 quiet=quiet,
                 json=json,
@@ -246,7 +252,7 @@ def detect(
             level=level,
             convention=convention,
             capacity=capacity,
-            min_score=min_score,
+            min_score=least,
             keep=keep,
             crops=crops,
             sheet=sheet,

@@ -1,15 +1,15 @@
-"""Which boxes a command writes and draws, by class and place: a look at the answer; nothing compiles."""
+"""Which boxes a command writes and draws, by class, score and place; nothing compiles."""
 
 import dataclasses
 import math
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from jaxbox._box_rows import MIN_CORNERS, AnyRows, in_polygon
+from jaxbox._box_rows import MIN_CORNERS, AnyRows, in_polygon, reaches
 from jaxbox._files import InputError, finite_number, read_text
 from jaxbox.types import Label
 
@@ -27,6 +27,7 @@ WithinOption = Annotated[
         "X_MIN,X_MAX,Y_MIN,Y_MAX, as -10,60,-20,20; or a text file of a polygon, x y a line.",
     ),
 ]
+MIN_SCORE_METAVAR = "SCORE|CLASS=SCORE,..."
 _RECTANGLE = 4
 
 
@@ -34,22 +35,27 @@ _RECTANGLE = 4
 class BoxFilter:
     """Which boxes are kept.
 
-    >>> BoxFilter.chosen(classes="cars", within="-10,60,-20,20").recorded()
-    {'classes': ['car'], 'within': [[60.0, 20.0], [-10.0, 20.0], [-10.0, -20.0], [60.0, -20.0]]}
+    >>> BoxFilter.chosen(classes="cars", within="30", min_scores={"van": 0.2}).recorded()
+    {'classes': ['car'], 'within': 30.0, 'min_scores': {'van': 0.2}}
     """
 
     classes: tuple[str, ...] | None = None
     """`Label.word` of each class; None is all."""
     within: float | tuple[tuple[float, ...], ...] | None = None
     """Radius from the sensor, m, or the corners of a polygon, m, sensor frame; None is everywhere."""
+    min_scores: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Least score of some classes, by `Label.word`."""
 
     @classmethod
-    def chosen(cls, *, classes: str | None, within: str | None) -> "BoxFilter":
-        """The filter of two options of the command line.
+    def chosen(
+        cls, *, classes: str | None, within: str | None, min_scores: Mapping[str, float] | None = None
+    ) -> "BoxFilter":
+        """The filter of options of the command line.
 
         Args:
           classes: as `ClassesOption`.
           within: as `WithinOption`.
+          min_scores: by class, from `parse_min_score`.
 
         Raises:
           InputError: naming the option.
@@ -57,12 +63,14 @@ class BoxFilter:
         return cls(
             None if classes is None else _parse_classes(classes),
             None if within is None else _parse_area(within),
+            min_scores or {},
         )
 
     def recorded(self) -> dict[str, Any]:
         """The filter as JSON can hold it, for the account of the run."""
         area = self.within if not isinstance(self.within, tuple) else [list(corner) for corner in self.within]
-        return {"classes": None if self.classes is None else list(self.classes), "within": area}
+        classes = None if self.classes is None else list(self.classes)
+        return {"classes": classes, "within": area, "min_scores": dict(self.min_scores) or None}
 
     def __call__(self, boxes: AnyRows) -> AnyRows:
         """The boxes with the others no longer valid: shapes and rows stay.
@@ -74,6 +82,7 @@ class BoxFilter:
         center = np.asarray(boxes.center, np.float64)
         if self.classes is not None:
             keep &= np.isin(boxes.label, [label.value for label in Label if label.word in self.classes])
+        keep &= reaches(boxes.score, boxes.label, self.min_scores)
         if isinstance(self.within, tuple):
             keep &= in_polygon(center, self.within)
         elif self.within is not None:
@@ -85,8 +94,56 @@ EVERY_BOX = BoxFilter()
 """All are kept."""
 
 
+def parse_min_score(text: str) -> tuple[float, dict[str, float]]:
+    """Reads ``--min-score``: one score, or scores of classes, and one at most of the others.
+
+    Args:
+      text: such as "0.15", "car=0.15,van=0.2" or "0.1,van=0.2".
+
+    Returns:
+      The least score of any class, and of each class where they differ.
+
+    Raises:
+      InputError: for an unknown class, a score that is none, or a class that stands twice.
+
+    >>> parse_min_score("0.15")
+    (0.15, {})
+    >>> parse_min_score("0.15,van=0.2")
+    (0.15, {'car': 0.15, 'van': 0.2, 'truck': 0.15})
+    """
+    scores: dict[str, float] = {}
+    for part in text.split(","):
+        name, _, number = part.rpartition("=")
+        word = _class_words().get(name.strip().lower()) if name else ""
+        if word is None:
+            names = ", ".join(label.word for label in Label)
+            raise InputError(f"--min-score {text}: {name.strip()!r} is no class; choose from {names}.")
+        if word in scores:
+            raise InputError(f"--min-score {text}: {part.strip()!r} says again what stands before it.")
+        scores[word] = _parse_score(number, text)
+    by_class = {label.word: scores.get(label.word, scores.get("", 0.0)) for label in Label}
+    return min(by_class.values()), by_class if set(scores) != {""} else {}
+
+
+def _parse_score(number: str, text: str) -> float:
+    try:
+        score = float(number)
+    except ValueError:
+        score = math.nan
+    if not 0 <= score <= 1:
+        raise InputError(
+            f"--min-score {text}: {number.strip()!r} is no score from 0 to 1; give one, or CLASS=SCORE,..."
+        )
+    return score
+
+
+def _class_words() -> dict[str, str]:
+    """`Label.word` by singular and plural."""
+    return {name: label.word for label in Label for name in (label.word, label.plural)}
+
+
 def _parse_classes(text: str) -> tuple[str, ...]:
-    known = {name: label.word for label in Label for name in (label.word, label.plural)}
+    known = _class_words()
     words = [word.strip().lower() for word in text.split(",")]
     if unknown := [word for word in words if word not in known]:
         names = ", ".join(label.word for label in Label)

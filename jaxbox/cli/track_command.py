@@ -5,7 +5,13 @@ from typing import Annotated, Any
 
 import typer
 
-from jaxbox.cli.box_filter import BoxFilter, ClassesOption, WithinOption
+from jaxbox.cli.box_filter import (
+    MIN_SCORE_METAVAR,
+    BoxFilter,
+    ClassesOption,
+    WithinOption,
+    parse_min_score,
+)
 from jaxbox.cli.config_options import chosen_config, chosen_track_config
 from jaxbox.cli.console import input_errors
 from jaxbox.cli.options import (
@@ -123,13 +129,13 @@ def track(
         ),
     ] = False,
     min_score: Annotated[
-        float,
+        str,
         typer.Option(
-            min=0.0,
-            max=1.0,
-            help=f"Leave out lower scores; pictures never show less than {SHOWN_MIN_SCORE:g}.",
+            metavar=MIN_SCORE_METAVAR,
+            help="Leave out lower scores, of all or by class; "
+            f"pictures never show less than {SHOWN_MIN_SCORE:g}.",
         ),
-    ] = 0.0,
+    ] = "0",
     classes: ClassesOption = None,
     within: WithinOption = None,
     preset: PresetOption = None,
@@ -175,6 +181,7 @@ def track(
         if not rate_hz > 0:
             raise typer.BadParameter(f"--rate-hz is {rate_hz:g}; give sweeps a second, such as 10.")
         convention = PointConvention(scale, axes, flip, columns)
+        least, by_class = parse_min_score(min_score)
         common: dict[str, Any] = {
             "config": chosen_config(preset, settings, changes or [], sensor=sensor),
             "track_config": chosen_track_config(track_changes or []),
@@ -185,16 +192,16 @@ def track(
             "confirmed": confirmed,
             "topic": topic,
             "capacity": capacity,
-            "min_score": min_score,
+            "min_score": least,
             "resume": resume,
             "quiet": quiet,
             "json": json,
         }
-        keep = BoxFilter.chosen(classes=classes, within=within)
+        keep = BoxFilter.chosen(classes=classes, within=within, min_scores=by_class)
         if engine is Engine.RAY:
-            kept = {"--classes": classes, "--within": within, "--coasting": coasting}
+            kept = {"--classes": classes, "--within": within, "--min-score by class": by_class}
             drawn = {"--pictures": pictures, "--video": video, "--gif": gif, "--crops": crops}
-            other = kept | drawn | {"--level": level, "--sensor-at": sensor_at}
+            other = kept | drawn | {"--coasting": coasting, "--level": level, "--sensor-at": sensor_at}
             check_ray(other, formats=result_format, points=points, convention=convention)
             ray_options = TrackRayOptions(
                 output=output,
