@@ -65,7 +65,12 @@ def rectangle_candidates(
     along_scene = config.box.scene_direction and config.completion.along_scene
     if not along_scene:
         return [best_rectangles(rotations, preference)]
-    second = [dataclasses.replace(each, curve=second_peak(each.curve, each.num_points)) for each in rotations]
+    second = [
+        dataclasses.replace(
+            each, curve=second_peak(each.curve, each.num_points, max_loss=float(config.box.second_peak_loss))
+        )
+        for each in rotations
+    ]
     return [
         best_rectangles(rotations, preference, gain=0),
         best_rectangles(rotations, preference, gain=PREFERENCE_GAIN),
@@ -73,19 +78,20 @@ def rectangle_candidates(
     ]
 
 
-def second_peak(curve: np.ndarray, num_points: int) -> np.ndarray:
+def second_peak(curve: np.ndarray, num_points: int, *, max_loss: float) -> np.ndarray:
     """A curve without what is less than 15 degrees from its best rotation.
 
     Args:
       curve: (A,) larger is better.
       num_points: that it is of.
+      max_loss: how much worse another rotation may be.
 
     Returns:
-      (A,); the curve itself of less than 30 points, or where nothing farther comes within .03 of the best.
+      (A,); the curve itself of less than 30 points, or where nothing farther comes so near to the best.
     """
     turn = np.abs(np.arange(len(curve)) - np.argmax(curve)) * 90 / len(curve)
     others = np.where(np.minimum(turn, 90 - turn) >= 15, curve, -np.inf)
-    return others if num_points >= 30 and others.max() > curve.max() - 0.03 else curve
+    return others if num_points >= 30 and others.max() > curve.max() - max_loss else curve
 
 
 def try_rotations(xy: np.ndarray, config: BoxConfig) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox.config import BoxConfig, DetectorConfig
+from jaxbox.config import BoxConfig, DetectorConfig, Scalar
 from jaxbox.stages.state import Outlines, Rectangles, Rotations
 from jaxbox.xla import chunks
 from jaxbox.xla.arithmetic import fast_max, fast_min
@@ -20,9 +20,9 @@ from jaxbox.xla.sorting import largest_first
 PREFERENCE_GAIN = 5.0
 """How often the scene's direction counts for the second candidate of a cluster: it bends a closeness only."""
 
-PEAKS_APART_DEG, MAX_PEAK_LOSS, MIN_PEAK_POINTS = 15.0, 0.03, 30
-"""A second peak differs by so much from the best rotation, is worse by less than this closeness, and is
-looked for where a rectangle is fitted to so many points: to weigh it takes time."""
+PEAKS_APART_DEG, MIN_PEAK_POINTS = 15.0, 30
+"""A second peak differs by so much from the best rotation, and is looked for where a rectangle is fitted to
+so many points: to weigh it takes time."""
 
 FAR_M = 1e12
 """Farther away than any point."""
@@ -91,7 +91,8 @@ def rectangle_candidates(
 
     def second(columns: tuple[jax.Array, ...]) -> jax.Array:
         curve, extents, num_points = columns
-        return best_rectangles(second_peak(curve, num_points[0]), extents, preference, gain=0).rows.T
+        curve = second_peak(curve, num_points[0], max_loss=config.box.second_peak_loss)
+        return best_rectangles(curve, extents, preference, gain=0).rows.T
 
     columns = rotations.curve, rotations.extents, rotations.num_points[None]
     rows = map_rows(second, columns, num_rows=num_clusters, chunk=chunks.PROPOSALS, axis=-1)
@@ -102,7 +103,7 @@ def rectangle_candidates(
     ]
 
 
-def second_peak(curve: jax.Array, num_points: jax.Array) -> jax.Array:
+def second_peak(curve: jax.Array, num_points: jax.Array, *, max_loss: Scalar) -> jax.Array:
     """What is left of curves apart from their best rotation, where something else is nearly as good.
 
     A vehicle that is seen in part may fit nearly as well at two rotations, and a little noise decides.
@@ -110,6 +111,7 @@ def second_peak(curve: jax.Array, num_points: jax.Array) -> jax.Array:
     Args:
       curve: (A, P) float32, see `try_rotations`.
       num_points: (P,) int32, that they are of.
+      max_loss: () of the curve's value, from the best rotation to another that is nearly as good.
 
     Returns:
       (A, P) float32: minus infinity near the best rotation. The curve itself of few points, and where no
@@ -122,7 +124,7 @@ def second_peak(curve: jax.Array, num_points: jax.Array) -> jax.Array:
     turn = jnp.abs(jnp.arange(num_angles, dtype=jnp.int32)[:, None] - best[None])
     apart_deg = jnp.minimum(turn, num_angles - turn).astype(jnp.float32) * (90 / num_angles)
     others = jnp.where(apart_deg >= PEAKS_APART_DEG, curve, -jnp.inf)
-    has_other = (num_points >= MIN_PEAK_POINTS) & (jnp.max(others, axis=0) > greatest - MAX_PEAK_LOSS)
+    has_other = (num_points >= MIN_PEAK_POINTS) & (jnp.max(others, axis=0) > greatest - max_loss)
     return jnp.where(has_other[None], others, curve)
 
 
