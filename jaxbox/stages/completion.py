@@ -180,7 +180,7 @@ def _complete_by_evidence(
         return dataclasses.replace(place(sides, sizes, placement, objective), in_row=in_row)
 
     rows = hypotheses.cluster, hypotheses.label, *judged
-    return map_rows(complete, rows, num_rows=hypotheses.num), num
+    return map_rows(complete, rows, num_rows=hypotheses.num, chunk=chunks.PROPOSALS), num
 
 
 def _assign(candidates: Sequence[Rectangles], number: jax.Array, cluster: jax.Array) -> Assignments:
