@@ -156,6 +156,24 @@ def test_the_same_entries_are_looked_up_in_each_table(shape):
 
 
 @pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("num_places", [1, 200])
+def test_corners_are_the_entries_of_two_by_two_cells(num_places):
+    rng = np.random.default_rng(num_places)
+    table = rng.normal(size=(6, 9)).astype(np.float32)
+    i, j = (rng.integers(0, size - 1, num_places, np.int32) for size in table.shape)
+    i[-1], j[-1] = 4, 7
+    found = jax.jit(functools.partial(rows.lookup_corners))(table, i, j)
+    expected = [table[i, j], table[i, j + 1], table[i + 1, j], table[i + 1, j + 1]]
+    np.testing.assert_array_equal(found, expected)
+
+
+@pytest.mark.usefixtures("platform")
+def test_stored_columns_are_the_columns():
+    table = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)
+    np.testing.assert_array_equal(jax.jit(functools.partial(rows.stored_columns))(table), table.T)
+
+
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("density", [0.0, 0.5, 1.0])
 def test_rows_that_are_not_kept_are_zeros_whatever_they_hold(density):
     rng = np.random.default_rng(0)

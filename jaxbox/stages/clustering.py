@@ -14,7 +14,7 @@ from jaxbox.xla.components import NONE, CellGrids, label_components
 from jaxbox.xla.hashing import lattice_numbers
 from jaxbox.xla.loops import map_rows
 from jaxbox.xla.maps import flag_cells, map_tables
-from jaxbox.xla.rows import compact, lookup_pair, pack_pairs, take
+from jaxbox.xla.rows import compact, lookup_pair, pack_pairs, stored_columns, take
 from jaxbox.xla.segments import reduce_segments, segment_minima
 from jaxbox.xla.sorting import compact_groups
 
@@ -141,7 +141,8 @@ def compress_range(xy: jax.Array, *, start_m: jax.Array | float, growth: jax.Arr
 
     Reference: oracle `jaxbox.reference.compress_range`.
     """
-    rho = jnp.sqrt(xy[:, 0] ** 2 + xy[:, 1] ** 2)
+    x, y = stored_columns(xy)
+    rho = jnp.sqrt(x**2 + y**2)
     beyond = jnp.maximum(rho - start_m, 0)
     # The limit of log(1 + k d) / k for k -> 0 is d.
     safe_growth = jnp.maximum(growth, 1e-6)
@@ -374,8 +375,9 @@ def sampling_rank(xy: jax.Array, z: jax.Array) -> jax.Array:
 
     Reference: oracle `jaxbox.reference.sampling_rank`.
     """
-    column = jnp.floor(arctan2(xy[:, 1], xy[:, 0]) * COLUMNS_PER_RAD)
-    rho = jnp.maximum(jnp.sqrt(xy[:, 0] ** 2 + xy[:, 1] ** 2), MIN_RANGE_M)
+    x, y = stored_columns(xy)
+    column = jnp.floor(arctan2(y, x) * COLUMNS_PER_RAD)
+    rho = jnp.maximum(jnp.sqrt(x**2 + y**2), MIN_RANGE_M)
     circle = jnp.floor(z / rho * CIRCLES_PER_UNIT)
     return lattice_numbers(column.astype(jnp.int32), circle.astype(jnp.int32), NUM_RANKS)
 

@@ -20,7 +20,7 @@ from jaxbox.xla.grids import margin_cells, window_counts
 from jaxbox.xla.hashing import hashed_uniform
 from jaxbox.xla.least_squares import refit_plane
 from jaxbox.xla.loops import apply_in_turn, map_batches, repeat
-from jaxbox.xla.rows import compact, count_true, lookup, maximum, take
+from jaxbox.xla.rows import compact, count_true, lookup, lookup_corners, maximum, take
 from jaxbox.xla.segments import segment_minima
 
 FAR_FILL_WIDTH = 4
@@ -481,6 +481,6 @@ def surface_height(surface: jax.Array, xy: jax.Array, config: GroundConfig) -> j
     at = [jnp.clip((xy[..., a] + half_m) / square_m - 0.5, 0, n - 1.001) for a in (0, 1)]
     i, j = (value.astype(jnp.int32) for value in at)
     u, v = at[0] - i.astype(jnp.float32), at[1] - j.astype(jnp.float32)
-    near = lookup(surface, i, j) * (1 - v) + lookup(surface, i, j + 1) * v
-    far = lookup(surface, i + 1, j) * (1 - v) + lookup(surface, i + 1, j + 1) * v
+    corners = lookup_corners(surface, i, j)
+    near, far = (first * (1 - v) + second * v for first, second in (corners[:2], corners[2:]))
     return near * (1 - u) + far * u

@@ -223,6 +223,20 @@ def keep_rows(rows: jax.Array, keep: jax.Array) -> jax.Array:
     return materialize(jnp.where(keep[:, None], rows, 0))
 
 
+def stored_columns(rows: jax.Array) -> tuple[jax.Array, ...]:
+    """The columns of a table, each stored by itself. Law: ``tuple(rows.T)``.
+
+    What is computed from one number of each row, at some length, does not vectorise on a CPU.
+
+    Args:
+      rows: (N, C).
+
+    Returns:
+      C of (N,).
+    """
+    return materialize(tuple(rows[:, k] for k in range(rows.shape[1])))
+
+
 def take(rows: jax.Array, index: jax.Array, fill: Any = 0) -> jax.Array:
     """Rows at the indices, and a fill at the sentinel or any beyond. Law: ``rows[i] if i < N else fill``.
 
@@ -273,6 +287,27 @@ def lookup_each(tables: Sequence[jax.Array], *index: jax.Array) -> list[jax.Arra
     """
     index = materialize(index)
     return materialize([lookup(table, *index) for table in tables])
+
+
+def lookup_corners(table: jax.Array, i: jax.Array, j: jax.Array) -> tuple[jax.Array, ...]:
+    """The entries of 2 x 2 cells, row by row. Law: ``table[i + k, j + l]`` for k and l of 0 and 1.
+
+    For many look-ups on a CPU, each corner has a table of its own, so that all have one place.
+
+    Args:
+      table: (A, B).
+      i: (...) int32, in [0, A - 1).
+      j: (...) int32, in [0, B - 1).
+
+    Returns:
+      (...) each.
+    """
+    width = table.shape[1]
+    if on_accelerator() or i.size < table.size:
+        return tuple(lookup(table, i + down, j + right) for down in (0, 1) for right in (0, 1))
+    flat, place = table.reshape(-1), i * width + j
+    corners = materialize([jnp.roll(flat, -first) for first in (0, 1, width, width + 1)])
+    return tuple(lookup(corner, place) for corner in corners)
 
 
 def pack_pairs(number: jax.Array, small: jax.Array, num_bits: int) -> jax.Array:
