@@ -30,7 +30,7 @@ SENSORS: Mapping[int, SensorChanges] = {
     16: SensorChanges(
         changes={
             # From ring to ring the ground is not seen, so it is smoothed farther and rises less steeply.
-            "ground": {"smoothing_m": 2.0, "max_grade": 0.05},
+            "ground": {"smoothing_m": 2.0, "max_grade": 0.03},
             # A few beams meet a car: take those on its windows' edge too.
             # Rings one above the other lie far apart, but on one car.
             "clustering": {"adaptive_start_m": 5.0, "adaptive_growth": 0.07},
