@@ -412,6 +412,10 @@ def test_fit_points_are_the_slab_or_all_and_of_many_those_of_the_lowest_ranks():
     many, few = rule(max_points=99), rule(max_points=5)
     assert reference.fit_points(members, xyz, height, many).tolist() == list(range(104, 120))
     assert reference.fit_points(members[:8], xyz, height, many).tolist() == list(range(100, 108))
+    # 16 of 20 are in the slab.
+    for share, chosen in ((0.8, range(104, 120)), (0.81, range(100, 120))):
+        config = rule(max_points=99, min_slab_share=share)
+        assert reference.fit_points(members, xyz, height, config).tolist() == list(chosen)
     # Multiples of the golden ratio, modulo 1, below 4 / 16.
     golden = np.arange(20) * (5**0.5 - 1) / 2 % 1
     lowest = [100 + i for i in range(4, 20) if golden[i] < 4 / 16]

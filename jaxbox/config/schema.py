@@ -241,6 +241,9 @@ class BoxConfig:
     """Only points lower than this shape the rectangle: above are mirrors and the narrower cabin."""
     min_slab_points: Scalar = 5.0
     """Clusters with fewer points between those heights are fitted to all their points."""
+    min_slab_share: Scalar = 0.2
+    """So are those with a smaller share of their points there: a few that are left of a side that something
+    hides say little of its direction."""
     min_distance_m: Scalar = 0.05
     """Closeness: points nearer to an edge than this count as on it."""
     scene_direction: bool = _static(default=True)

@@ -37,9 +37,10 @@ def fit_points(members: np.ndarray, xyz: np.ndarray, height: np.ndarray, config:
       members: (m,) int, rows of the cluster's points in sweep order.
       xyz: (n, 3) m, sensor frame, of all points.
       height: (n,) m above the ground, likewise.
-      config: members between the slab's heights, both exclusive, are taken, unless they are too few: then
-        all are. Of more than `max_points` those of the lowest ranks, see `sampling_rank`, and of these,
-        where they are too many, `max_points` spread evenly: the floor(j count / max_points)-th.
+      config: members between the slab's heights, both exclusive, are taken, unless they are too few, or too
+        small a share of all: then all are. Of more than `max_points` those of the lowest ranks, see
+        `sampling_rank`, and of these, where they are too many, `max_points` spread evenly: the
+        floor(j count / max_points)-th.
 
     Returns:
       (k,) int, k <= max_points.
@@ -47,7 +48,8 @@ def fit_points(members: np.ndarray, xyz: np.ndarray, height: np.ndarray, config:
     slab = members[
         (height[members] > config.slab_min_height_m) & (height[members] < config.slab_max_height_m)
     ]
-    chosen = slab if len(slab) >= config.min_slab_points else members
+    least = max(float(config.min_slab_points), np.float32(config.min_slab_share) * np.float32(len(members)))
+    chosen = slab if len(slab) >= least else members
     chosen = chosen[sampling_rank(xyz[chosen]) < sampled_share(len(chosen), config.max_points)]
     if len(chosen) <= config.max_points:
         return chosen

@@ -64,7 +64,10 @@ def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Clusters:
     chosen = select_clusters(
         statistics, components.first, config.clustering, min_extent_m=config.vehicles.min_extent_m
     )
-    fit_all = chosen.num_slab.astype(jnp.float32) < config.box.min_slab_points
+    least = jnp.maximum(
+        config.box.min_slab_points, config.box.min_slab_share * chosen.num_points.astype(jnp.float32)
+    )
+    fit_all = chosen.num_slab.astype(jnp.float32) < least
     num_fitted = jnp.where(fit_all, chosen.num_points, chosen.num_slab)
     share = sampled_share(num_fitted, config.box.max_points)
     of_point, fitted = _find_clusters(obstacles, component, chosen.row, fit_all, share, config.box)
@@ -82,7 +85,7 @@ def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Clusters:
         num_large=num_large,
         num_runs=components.num_runs,
         num_found=chosen.found,
-        num_slab=jnp.max(chosen.sum_by_map(num_fitted)),
+        num_slab=jnp.max(jnp.sum(fitted, axis=1, dtype=jnp.int32)),
     )
 
 
@@ -263,13 +266,6 @@ class ChosenComponents:
     """(maps,) int32: clusters of each map that pass the gates, which may exceed its capacity."""
     kept: jax.Array
     """(maps,) int32: those in the list."""
-
-    def sum_by_map(self, values: jax.Array) -> jax.Array:
-        """(maps,) sums of values (P,) of the clusters over each map."""
-        end = jnp.cumsum(self.kept)[:, None]
-        row = jnp.arange(values.shape[0], dtype=jnp.int32)[None]
-        own = (row >= end - self.kept[:, None]) & (row < end)
-        return jnp.sum(jnp.where(own, values, 0), axis=1, dtype=values.dtype)
 
 
 def select_clusters(
