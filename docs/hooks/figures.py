@@ -335,7 +335,7 @@ def beams() -> str:
 
 
 def beams_recall() -> str:
-    """Recall by number of beams on the frames that chose nothing of the preset."""
+    """Recall by number of beams on the 58 frames that chose a part of the settings."""
     report = load("beams")
     others = [row for row in report["kitti"] if row["set"] == "58 frames"]
     found = {(row["sensor"], row["preset for"]): row["recall bev 0.5"] for row in others}
