@@ -11,6 +11,7 @@ one beyond may be particular to them. Settings that are thresholds share one com
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -143,6 +144,14 @@ def copy_figures(
     return {column: found[column] for column in COLUMNS}, bits
 
 
+def share_found(
+    selection: Selection, labels: kitti.Objects, results: kitti.Objects, num_points: Mapping[str, np.ndarray]
+) -> float:
+    """Share of the selected labels that are found; nan where there are none."""
+    recall = rates(labels, results, selection, num_points).recall
+    return math.nan if recall is None else recall
+
+
 def vehicle_figures(
     labels: kitti.Objects, results: kitti.Objects, num_points: Mapping[str, np.ndarray]
 ) -> dict[str, float]:
@@ -153,8 +162,8 @@ def vehicle_figures(
     every = rates(*merged, Selection(class_name=kitti.VEHICLE), num_points)
     return {
         "vehicles bev": next(curve.r40 for curve in curves if curve.difficulty == "moderate"),
-        "vans found": rates(labels, results, Selection("Van", MIN_POINTS), num_points).recall,
-        "trucks found": rates(labels, results, Selection("Truck", MIN_POINTS), num_points).recall,
+        "vans found": share_found(Selection("Van", MIN_POINTS), labels, results, num_points),
+        "trucks found": share_found(Selection("Truck", MIN_POINTS), labels, results, num_points),
         "false a frame": every.num_false / len(labels),
     }
 

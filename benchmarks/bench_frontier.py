@@ -15,8 +15,7 @@ import jax
 import numpy as np
 
 import jaxbox
-from benchmarks import common
-from benchmarks.bench_ablation import copy_figures
+from benchmarks import bench_accuracy, common
 from jaxbox import DetectorConfig, PointCloud
 from jaxbox.evaluation.copies import COPIES, Frame, label_points, read_frame
 from jaxbox.io import Sweep, open_sweeps
@@ -46,7 +45,11 @@ def measure_accuracy(
     frames: Sequence[Frame], num_points: Mapping[str, np.ndarray], config: DetectorConfig, num_copies: int
 ) -> dict[str, float]:
     """Mean figures over the copies."""
-    rows = [copy_figures(frames, num_points, copy, config)[0] for copy in COPIES[:num_copies]]
+    labels = {frame.name: frame.labels for frame in frames}
+    rows = []
+    for copy in COPIES[:num_copies]:
+        results, _ = bench_accuracy.detect_frames(frames, copy, config)
+        rows.append(bench_accuracy.figures(bench_accuracy.measure(labels, results, num_points)))
     means = {name: float(np.mean([row[name] for row in rows])) for name in COLUMNS[2:5]}
     return means | {"SOFT sd": float(np.std([row["SOFT"] for row in rows]))}
 

@@ -10,6 +10,7 @@ import pytest
 import jaxbox
 from jaxbox import DetectorConfig, reference
 from jaxbox.reference import ground as reference_ground
+from jaxbox.synthetic.situations import SITUATIONS
 from jaxbox.xla import backend
 
 MIN_SCORE = 0.05
@@ -148,3 +149,17 @@ def test_on_several_planes_boxes_stand_where_those_of_the_reference_do():
     np.testing.assert_allclose(bottoms[0], bottoms[1], atol=0.02)
     # The paper's boxes begin at the lowest point of the cluster above the ground.
     np.testing.assert_allclose(bottoms[0], [ROAD_Z + 0.2, TERRACE_Z + 0.2], atol=0.15)
+
+
+def test_on_two_planes_the_cars_of_a_platform_are_found_as_by_the_reference():
+    base = PRESETS["default"]
+    config = dataclasses.replace(base, ground=dataclasses.replace(base.ground, max_planes=2))
+    (platform,) = (each for each in SITUATIONS if each.name == "cars on a platform of 1 m")
+    for xyz, _ in platform.sweeps():
+        cloud = jaxbox.PointCloud.from_numpy(xyz, capacity=parity.CAPACITY)
+        ours, theirs = (
+            boxes_of(found)
+            for found in (parity.on_host(jaxbox.detect(cloud, config)), reference.detect(xyz, config))
+        )
+        counts = num_partners(ours, theirs) + num_partners(theirs, ours)
+        assert counts[0] == counts[1] >= 4

@@ -12,6 +12,7 @@ import pytest
 
 import jaxbox
 from jaxbox import Detections, Label, PointCloud, io, synthetic, viz
+from jaxbox.cli.box_filter import BoxFilter
 from jaxbox.config import RegionConfig
 from jaxbox.io.parquet import box_rows
 from jaxbox.tracking import TrackerState, observe, track_step
@@ -142,6 +143,17 @@ def test_filters_keep_what_they_say(found):
     ]
     with pytest.raises(ValueError, match="'bus' is not a class"):
         found.above({"bus": 0.5})
+
+
+def test_a_filter_keeps_rows_and_leaves_the_points_of_other_boxes_to_none(found):
+    host = found.on_host()
+    near = np.hypot(*host.center[:, :2].T) <= 15
+    kept = BoxFilter.chosen(classes=None, within="15")(host)
+    np.testing.assert_array_equal(kept.valid, host.valid & near)
+    assert 0 < kept.valid.sum() < host.valid.sum()
+    row = host.point_detection
+    np.testing.assert_array_equal(kept.point_detection, np.where((row >= 0) & near[row], row, -1))
+    assert 0 < (kept.point_detection >= 0).sum() < (row >= 0).sum()
 
 
 def test_boxes_within_a_region_or_a_polygon_are_those_whose_centres_are(found):

@@ -11,7 +11,7 @@ import typer
 
 from jaxbox._box_rows import MIN_CORNERS, AnyRows, in_polygon, reaches
 from jaxbox._files import InputError, finite_number, read_text
-from jaxbox.types import Label
+from jaxbox.types import Detections, Label
 
 ClassesOption = Annotated[
     str | None,
@@ -73,7 +73,7 @@ class BoxFilter:
         return {"classes": classes, "within": area, "min_scores": dict(self.min_scores) or None}
 
     def __call__(self, boxes: AnyRows) -> AnyRows:
-        """The boxes with the others no longer valid: shapes and rows stay.
+        """The boxes with the others no longer valid: shapes and rows stay. Their points belong to none.
 
         Args:
           boxes: of one sweep, on the host.
@@ -87,7 +87,12 @@ class BoxFilter:
             keep &= in_polygon(center, self.within)
         elif self.within is not None:
             keep &= np.hypot(center[:, 0], center[:, 1]) <= self.within
-        return dataclasses.replace(boxes, valid=keep)  # pyright: ignore[reportArgumentType]
+        changes: dict[str, Any] = {"valid": keep}
+        if isinstance(boxes, Detections):
+            # The last place is that of -1, for points of no box.
+            row, stays = np.asarray(boxes.point_detection), np.append(keep, False)
+            changes["point_detection"] = np.where(stays[row], row, -1)
+        return dataclasses.replace(boxes, **changes)  # pyright: ignore[reportArgumentType]
 
 
 EVERY_BOX = BoxFilter()
