@@ -85,7 +85,7 @@ def test_the_status_says_of_a_wrong_frame_what_the_documentation_says(name):
     assert Status(int(found.status)) == status
     num_found = int((found.score >= DEFAULT_SCORE_THRESHOLD).sum())
     expected = int((answer(bad_input.STREET.name, "default")[1].score >= DEFAULT_SCORE_THRESHOLD).sum())
-    assert expected > 3
+    assert expected >= 3
     if name in FOUND_IN:
         assert abs(num_found - expected) <= 1
     elif name not in MAY_BE_FOUND_IN:

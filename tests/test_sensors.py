@@ -144,7 +144,7 @@ def test_detect_sees_a_tilted_sweep_from_the_ground_upright(tmp_path):
         boxes[name] = np.array(
             [b["center"] for b in record["boxes"] if b["score"] >= DEFAULT_SCORE_THRESHOLD]
         )
-    assert len(boxes["tilted"]) >= len(boxes["upright"]) - 1 >= 4
+    assert len(boxes["tilted"]) >= len(boxes["upright"]) - 1 >= 2
     # Of boxes worth acting on, at most one is another's: the points differ by a hair.
     distance = np.linalg.norm(boxes["tilted"][:, None] - boxes["upright"], axis=-1).min(axis=0)
     assert np.sum(distance < 0.3) >= len(boxes["upright"]) - 1

@@ -20,7 +20,7 @@ SWEEP = synthetic.make_sweep(0, num_beams=32, num_azimuths=520)
 # The fewest maps, so that it compiles fastest.
 CONFIG = DetectorConfig.fast()
 SAME_IOU = 0.7
-NUM_FOUND = 5
+NUM_FOUND = 3
 """Boxes worth acting on in this sweep, of which most cars hold a few points only."""
 
 
