@@ -76,6 +76,7 @@ ABLATIONS = (
     Ablation("closeness to all four edges", {"box.criterion": "closeness"}),
     Ablation("no scene direction", {"box.direction_weight": 0.0}),
     Ablation("no third rectangle at a second peak", {"box.second_peak_loss": 0.0}),
+    Ablation("few points of a slab are fitted to", {"box.min_slab_share": 0.0}),
     Ablation("64 points a rectangle", {"box.max_points": 64}),
     Ablation("256 points a rectangle", {"box.max_points": 256}),
     # Completion.
@@ -88,7 +89,9 @@ ABLATIONS = (
     }),
     Ablation("no second reading along the scene", {"completion.along_scene": False}),
     Ablation("sides of the class's size, not the likely one", {"completion.seen_weight": 0.0}),
-    Ablation("far ends as fitted, not where the last point is", {"completion.end_points": NO_LIMIT}),
+    Ablation("far ends as fitted, not where the last point is", {
+        "completion.end_points": NO_LIMIT, "vehicles.hidden_length_score": 1.0,
+    }),
     Ablation("rows of vehicles side by side as others", {
         "completion.row_distance_m": 0.0, "completion.row_shift_m": 0.0,
     }),
@@ -104,8 +107,9 @@ ABLATIONS = (
     Ablation("no ring penalty", {"vehicles.ring_weight": 0.0}),
     Ablation("no overhead penalty", {"vehicles.overhead_weight": 0.0}),
     Ablation("all points above are overhead, connected or not", {"vehicles.overhead_gap_m": NO_LIMIT}),
+    Ablation("hidden lengths count as seen ones", {"vehicles.hidden_length_score": 1.0}),
     Ablation("no bumpers alone", {"vehicles.bumper_from_m": NO_LIMIT}),
-    Ablation("tops are as high as seen, cut off or not", {"vehicles.unseen_top_score": 0.0}),
+    Ablation("tops are as high as seen, cut off, bumpers or not", {"vehicles.unseen_top_score": 0.0}),
     Ablation("trucks: nothing past the ends counts", {"vehicles.classes.2.past_ends_m": 0.0}),
     Ablation("trucks: free space below the body counts", {"vehicles.classes.2.open_below": 0.0}),
     Ablation("trucks: 2.4 m high where they are cut off, too", {"vehicles.classes.2.min_cut_height_m": 2.4}),

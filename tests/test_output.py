@@ -51,6 +51,8 @@ def test_a_filter_that_cannot_be_says_so(options, words):
         ("bus=0.5", "'bus' is no class; choose from car, van, truck"),
         ("car=0.5,cars=0.4", "'cars=0.4' says again"),
         ("0.1,0.2", "'0.2' says again"),
+        ("0.1,", "'' is no score"),
+        ("=0.5", "'' is no class"),
     ],
 )
 def test_a_least_score_that_cannot_be_says_so(text, words):

@@ -73,7 +73,7 @@ class BoxFilter:
         return {"classes": classes, "within": area, "min_scores": dict(self.min_scores) or None}
 
     def __call__(self, boxes: AnyRows) -> AnyRows:
-        """The boxes with the others no longer valid: shapes and rows stay. Their points belong to none.
+        """The boxes with the others no longer valid: shapes and rows stay. Points left out belong to none.
 
         Args:
           boxes: of one sweep, on the host.
@@ -118,14 +118,15 @@ def parse_min_score(text: str) -> tuple[float, dict[str, float]]:
     """
     scores: dict[str, float] = {}
     for part in text.split(","):
-        name, _, number = part.rpartition("=")
-        word = _class_words().get(name.strip().lower()) if name else ""
+        name, of_class, number = part.rpartition("=")
+        word = _class_words().get(name.strip().lower()) if of_class else ""
         if word is None:
             names = ", ".join(label.word for label in Label)
             raise InputError(f"--min-score {text}: {name.strip()!r} is no class; choose from {names}.")
+        score = _parse_score(number, text)
         if word in scores:
             raise InputError(f"--min-score {text}: {part.strip()!r} says again what stands before it.")
-        scores[word] = _parse_score(number, text)
+        scores[word] = score
     by_class = {label.word: scores.get(label.word, scores.get("", 0.0)) for label in Label}
     return min(by_class.values()), by_class if set(scores) != {""} else {}
 

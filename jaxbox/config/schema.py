@@ -242,8 +242,8 @@ class BoxConfig:
     min_slab_points: Scalar = 5.0
     """Clusters with fewer points between those heights are fitted to all their points."""
     min_slab_share: Scalar = 0.2
-    """So are those with a smaller share of their points there: a few that are left of a side that something
-    hides say little of its direction."""
+    """Clusters with a smaller share of their points between those heights are fitted to all of them: the few
+    visible points of a hidden side say little of its direction."""
     min_distance_m: Scalar = 0.05
     """Closeness: points nearer to an edge than this count as on it."""
     scene_direction: bool = _static(default=True)
@@ -359,8 +359,9 @@ class VehicleConfig:
     overhead_weight: Scalar = 6.0
     """score x exp(-weight x points above / points), where those above are connected to the vehicle."""
     hidden_length_score: Scalar = 0.7
-    """score x this where nothing shows how long the vehicle is, so that the class's length is answered; x 1
-    where its far end is seen, see ``completion.end_length``."""
+    """score x this where neither a measured side (``completion.seen_length``) nor a seen end
+    (``completion.end_length``) shows the length, x 1 where one does, and between by degree. Not in mode
+    "none", nor without ``neighbourhood``."""
     unseen_top_score: Scalar = 0.7
     """Score of the height where the top is out of sight, so that the class's height is answered: where the
     highest beam cuts a vehicle off, less where less than half of the class's width was measured; and where
