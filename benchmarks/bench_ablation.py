@@ -21,7 +21,7 @@ from benchmarks import bench_accuracy, common
 from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig
 from jaxbox.config.fields import replace_fields
 from jaxbox.evaluation import Selection, kitti, matching
-from jaxbox.evaluation.copies import COPIES, Copy, Frame, label_points, read_frame
+from jaxbox.evaluation.copies import COPIES, Copy, Frame, label_points, labelled_frames
 from jaxbox.io import open_sweeps
 
 FULL = "default preset"
@@ -268,10 +268,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     chosen = [ablation for ablation in ABLATIONS if not options.only or ablation.name in options.only]
     base = common.chosen_config(options)
-    found = {
-        name: [frame for sweep in open_sweeps(common.data_folder(name)) if (frame := read_frame(sweep))]
-        for name in DATA.values()
-    }
+    found = {name: labelled_frames(open_sweeps(common.data_folder(name))) for name in DATA.values()}
     frames = [frame for some in found.values() for frame in some]
     sets = {frame.name: name for name, some in found.items() for frame in some}
     copies = COPIES[: options.copies]

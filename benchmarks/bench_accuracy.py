@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks import common
 from jaxbox import DetectorConfig
 from jaxbox.evaluation import Selection, kitti, report
-from jaxbox.evaluation.copies import COPIES, Copy, Frame, detect_copy, label_points, read_frame
+from jaxbox.evaluation.copies import COPIES, Copy, Frame, detect_copy, label_points, labelled_frames
 from jaxbox.io import KittiObject, find_drives, open_sweeps, read_drives
 
 METRICS = ("bev", "3d")
@@ -174,7 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options: argparse.Namespace = parser.parse_args(arguments)
     config = common.chosen_config(options)
     sweeps = [sweep for name in options.data for sweep in open_sweeps(common.data_folder(name))]
-    frames = [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
+    frames = labelled_frames(sweeps)
     labels = {frame.name: frame.labels for frame in frames}
     num_points = {frame.name: label_points(frame) for frame in frames}
     drives = drives_of(options, frames)

@@ -25,7 +25,7 @@ from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig, Label
 from jaxbox._padding import fitting_capacity
 from jaxbox.config.sensors import TUNED_BEAMS
 from jaxbox.evaluation import Selection, kitti, matching, pairwise_overlaps, report, thin_beams
-from jaxbox.evaluation.copies import COPIES, Copy, Frame, detect_copy, read_frame
+from jaxbox.evaluation.copies import COPIES, Copy, Frame, detect_copy, labelled_frames
 from jaxbox.io import open_sweeps
 from jaxbox.synthetic import SyntheticSweep, make_sweep
 
@@ -120,7 +120,7 @@ def run_kitti(options: argparse.Namespace) -> list[dict[str, Any]]:
     sets = {}
     for name, folder in SETS.items():
         sweeps = open_sweeps(common.data_folder(folder))
-        frames = [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
+        frames = labelled_frames(sweeps)
         sets[name] = frames[:: len(frames) // QUICK_FRAMES] if options.quick else frames
     copies = COPIES[: 1 if options.quick else options.copies]
     return [

@@ -24,7 +24,7 @@ from benchmarks import common
 from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig
 from jaxbox._padding import fitting_capacity
 from jaxbox.evaluation import Selection, kitti, matching
-from jaxbox.evaluation.copies import COPIES, Copy, Frame, detect_copy, read_frame
+from jaxbox.evaluation.copies import COPIES, Copy, Frame, detect_copy, labelled_frames
 from jaxbox.evaluation.corruptions import CORRUPTIONS, Corruption
 from jaxbox.io import open_sweeps
 from jaxbox.viz.plots import save_figure
@@ -165,7 +165,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     config = common.chosen_config(options)
     sweeps = open_sweeps(common.data_folder("kitti_object"))
-    frames = [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
+    frames = labelled_frames(sweeps)
     copies, severities = COPIES[: options.copies], range(1, 6)
     if options.quick:
         frames, copies, severities = frames[::5], COPIES[:1], (1, 5)

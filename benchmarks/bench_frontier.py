@@ -17,7 +17,7 @@ import numpy as np
 import jaxbox
 from benchmarks import bench_accuracy, common
 from jaxbox import DetectorConfig, PointCloud
-from jaxbox.evaluation.copies import COPIES, Frame, label_points, read_frame
+from jaxbox.evaluation.copies import COPIES, Frame, label_points, labelled_frames
 from jaxbox.io import Sweep, open_sweeps
 from jaxbox.viz.plots import save_figure
 
@@ -78,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     presets = {name: common.chosen_config(options, preset=name) for name in DetectorConfig.presets()}
     sweeps = open_sweeps(common.data_folder("kitti_object"))
-    frames = [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
+    frames = labelled_frames(sweeps)
     num_points = {frame.name: label_points(frame) for frame in frames}
     spent = time_presets(sweeps, presets)
     table: dict[str, dict[str, Any]] = {}

@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks import common
 from benchmarks.bench_beams import measure
 from jaxbox import DetectorConfig
-from jaxbox.evaluation.copies import Frame, read_frame
+from jaxbox.evaluation.copies import Frame, labelled_frames
 from jaxbox.geometry.mounting import Mounting, measure_mounting
 from jaxbox.io import objects_from_detections, open_sweeps
 
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options: argparse.Namespace = parser.parse_args(arguments)
     config = common.chosen_config(options)
     sweeps = open_sweeps(common.data_folder("kitti_object"))
-    frames = [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
+    frames = labelled_frames(sweeps)
     if options.quick:
         frames = frames[:: len(frames) // QUICK_FRAMES]
     rows: list[dict[str, Any]] = []

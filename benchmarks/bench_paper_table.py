@@ -22,7 +22,7 @@ import numpy as np
 from benchmarks import common
 from jaxbox import Detections, DetectorConfig, Label
 from jaxbox.evaluation import pairwise_overlaps, size_errors
-from jaxbox.evaluation.copies import Frame, label_points, read_frame
+from jaxbox.evaluation.copies import Frame, label_points, labelled_frames
 from jaxbox.evaluation.report import MATCH_OVERLAP
 from jaxbox.evaluation.sizes import MEDIAN_CAR_SIZE_M
 from jaxbox.io import KittiObject, boxes_from_objects, open_sweeps
@@ -220,8 +220,7 @@ def print_windows(measured: Mapping[str, Any]) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = common.parser(__doc__ or "", preset=False)
     options: argparse.Namespace = parser.parse_args(arguments)
-    frames = [read_frame(sweep) for sweep in open_sweeps(common.data_folder("kitti_tracking"))]
-    tracks = vehicle_tracks([frame for frame in frames if frame is not None])
+    tracks = vehicle_tracks(labelled_frames(open_sweeps(common.data_folder("kitti_tracking"))))
     name, window = choose_vehicle(tracks)
     class_name = window[0].label.type
     report: dict[str, Any] = {"track": name, "class": class_name, "paper": PAPER}

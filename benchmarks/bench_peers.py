@@ -29,7 +29,7 @@ import jaxbox
 from benchmarks import common
 from benchmarks.peers.chains import PEERS, Answer, Chain, PclProcess, make_peers
 from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig, PointCloud, reference
-from jaxbox.evaluation.copies import Frame, label_points, read_frame
+from jaxbox.evaluation.copies import Frame, label_points, labelled_frames
 from jaxbox.io import boxes_from_objects, open_sweeps
 
 QUICK_SWEEPS = 6
@@ -208,7 +208,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--guard", type=pathlib.Path, metavar="FILE", help="fail where slower than recorded")
     options: argparse.Namespace = parser.parse_args(arguments)
     common.enable_cache()
-    frames = [f for sweep in open_sweeps(common.data_folder("kitti_object")) if (f := read_frame(sweep))]
+    frames = labelled_frames(open_sweeps(common.data_folder("kitti_object")))
     frames = frames[:: len(frames) // QUICK_SWEEPS][:QUICK_SWEEPS] if options.quick else frames
     chains, missing = chosen_chains(options.only)
     rows = run_all(chains, frames, QUICK_ROUNDS if options.quick else ROUNDS)

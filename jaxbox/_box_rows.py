@@ -304,9 +304,8 @@ def _chosen_rows(valid: np.ndarray, index: Any) -> np.ndarray:
 def _label(label: Label | str) -> Label:
     if isinstance(label, Label):
         return label
-    for known in Label:
-        if str(label).lower() in (known.word, known.plural):
-            return known
+    if (known := Label.named(str(label))) is not None:
+        return known
     words = ", ".join(f'"{known.word}"' for known in Label)
     raise ValueError(f"{label!r} is not a class; choose one of {words}.")
 

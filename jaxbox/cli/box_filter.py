@@ -116,19 +116,18 @@ def parse_min_score(text: str) -> tuple[float, dict[str, float]]:
     >>> parse_min_score("0.15,van=0.2")
     (0.15, {'car': 0.15, 'van': 0.2, 'truck': 0.15})
     """
-    scores: dict[str, float] = {}
+    scores: dict[Label | None, float] = {}
     for part in text.split(","):
         name, of_class, number = part.rpartition("=")
-        word = _class_words().get(name.strip().lower()) if of_class else ""
-        if word is None:
-            names = ", ".join(label.word for label in Label)
-            raise InputError(f"--min-score {text}: {name.strip()!r} is no class; choose from {names}.")
+        label = Label.named(name.strip()) if of_class else None
+        if of_class and label is None:
+            raise InputError(f"--min-score {text}: {name.strip()!r} is no class; choose from {_words()}.")
         score = _parse_score(number, text)
-        if word in scores:
+        if label in scores:
             raise InputError(f"--min-score {text}: {part.strip()!r} says again what stands before it.")
-        scores[word] = score
-    by_class = {label.word: scores.get(label.word, scores.get("", 0.0)) for label in Label}
-    return min(by_class.values()), by_class if set(scores) != {""} else {}
+        scores[label] = score
+    by_class = {label.word: scores.get(label, scores.get(None, 0.0)) for label in Label}
+    return min(by_class.values()), by_class if set(scores) != {None} else {}
 
 
 def _parse_score(number: str, text: str) -> float:
@@ -143,18 +142,15 @@ def _parse_score(number: str, text: str) -> float:
     return score
 
 
-def _class_words() -> dict[str, str]:
-    """`Label.word` by singular and plural."""
-    return {name: label.word for label in Label for name in (label.word, label.plural)}
+def _words() -> str:
+    return ", ".join(label.word for label in Label)
 
 
 def _parse_classes(text: str) -> tuple[str, ...]:
-    known = _class_words()
-    words = [word.strip().lower() for word in text.split(",")]
-    if unknown := [word for word in words if word not in known]:
-        names = ", ".join(label.word for label in Label)
-        raise InputError(f"--classes {text}: {unknown[0]!r} is none; choose from {names}.")
-    return tuple(label.word for label in Label if label.word in {known[word] for word in words})
+    labels = {word.strip(): Label.named(word.strip()) for word in text.lower().split(",")}
+    if unknown := [word for word, label in labels.items() if label is None]:
+        raise InputError(f"--classes {text}: {unknown[0]!r} is none; choose from {_words()}.")
+    return tuple(label.word for label in Label if label in labels.values())
 
 
 def _parse_area(text: str) -> float | tuple[tuple[float, ...], ...]:

@@ -17,7 +17,7 @@ from jaxbox.cli.console import ExitCode, exit_code, make_progress, print_error
 from jaxbox.cli.report import make_table
 from jaxbox.config import DetectorConfig
 from jaxbox.config.fields import PRESET_KEY, changed_fields
-from jaxbox.evaluation.copies import COPIES, read_frame
+from jaxbox.evaluation.copies import COPIES, labelled_frames
 from jaxbox.evaluation.objectives import OBJECTIVES
 from jaxbox.io import (
     InputError,
@@ -155,7 +155,7 @@ def make_bench(labels: Sequence[pathlib.Path], options: TuneOptions) -> Bench:
       InputError: where there are none, one cannot be read, or a frame has no drive.
     """
     sweeps = open_sweeps(labels, convention=options.convention)
-    frames = [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
+    frames = labelled_frames(sweeps)
     if not frames:
         raise InputError(
             f"{', '.join(map(str, labels))}: no sweep there has labels and a calibration; give a labelled "

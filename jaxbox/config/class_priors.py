@@ -145,6 +145,15 @@ class Label(enum.IntEnum):
         """
         return f"{self.word}es" if self.word.endswith(_HISSING) else f"{self.word}s"
 
+    @classmethod
+    def named(cls, name: str) -> "Label | None":
+        """The class of a name, in singular or plural and in letters of any size; None for no class.
+
+        >>> Label.named("Vans"), Label.named("bus")
+        (<Label.VAN: 1>, None)
+        """
+        return next((each for each in cls if name.lower() in (each.word, each.plural)), None)
+
     CAR = ClassPrior(
         length_m=3.9,
         width_m=1.63,

@@ -6,6 +6,7 @@ one, so a difference between two settings is judged by their mean next to their 
 """
 
 import dataclasses
+from collections.abc import Iterable
 
 import jax
 import jax.numpy as jnp
@@ -75,6 +76,21 @@ def read_frame(sweep: Sweep) -> Frame | None:
     if labels is None or calibration is None:
         return None
     return Frame(sweep.name, *sweep.read_points(), calibration, labels)
+
+
+def labelled_frames(sweeps: Iterable[Sweep]) -> list[Frame]:
+    """The sweeps that have labels and a calibration, read.
+
+    Args:
+      sweeps: any sweeps.
+
+    Returns:
+      Their frames, in their order.
+
+    Raises:
+      InputError: naming the file, where one cannot be read.
+    """
+    return [frame for sweep in sweeps if (frame := read_frame(sweep)) is not None]
 
 
 def turn_points(xyz: np.ndarray, copy: Copy) -> np.ndarray:

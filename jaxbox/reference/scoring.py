@@ -210,7 +210,7 @@ def score_box(
       reach: m above the ground, height of the highest beam where the box begins.
 
     Returns:
-      The score; 0 where a gate of the class closes.
+      The score, without what a hidden length costs; 0 where a gate of the class closes.
     """
     early = early_score(
         box,

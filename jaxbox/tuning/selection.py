@@ -141,16 +141,16 @@ def leave_one_out(
         name: max(blind, key=lambda index: (np.mean(blind[index].scores_without[name]), -index))
         for name in names
     }
+    held_out = {name: blind[index] for name, index in chosen.items()}
     copies = range(len(trials[0].matches))
     scores = tuple(
-        score(blind[chosen[group]].matches[copy][frame] for frame, group in groups.items()) for copy in copies
+        score(held_out[group].matches[copy][frame] for frame, group in groups.items()) for copy in copies
     )
     members = _members(groups)
     group_scores = {
-        name: (_group_mean(trials[0], frames, score), _group_mean(blind[chosen[name]], frames, score))
+        name: (_group_mean(trials[0], frames, score), _group_mean(held_out[name], frames, score))
         for name, frames in members.items()
     }
-    held_out = {name: blind[chosen[name]] for name in names}
     return HeldOut(
         chosen=chosen,
         scores=scores,
