@@ -57,6 +57,31 @@ def test_segments_have_the_maxima_and_sums_of_their_rows(num_maps, size):
         np.testing.assert_array_equal(table, expected)
 
 
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize(("operation", "ufunc"), [("add", np.add), ("max", np.maximum)])
+@pytest.mark.parametrize("size", [1, 7, 300])
+def test_segments_are_folded_from_what_their_rows_look_up(operation, ufunc, size):
+    rng = np.random.default_rng(size)
+    # Whole numbers: their sums are exact in any order.
+    table, num_segments = rng.integers(-9, 9, (20, 2)).astype(np.float32), 5
+    segment, row = rng.integers(0, [[num_segments + 1], [20]], (2, size), np.int32)
+    padded = jnp.asarray(np.concatenate([table, np.zeros((1, 2), np.float32)]))
+
+    def describe(segment, row):
+        return padded[row] + segment[:, None].astype(jnp.float32)
+
+    fold = jax.jit(
+        lambda num: segments.fold_segments(
+            operation, describe, segment, row, num_rows=num, num_segments=num_segments, absent=20
+        )
+    )
+    for num in (0, 1, size // 2, size, size + 9):
+        expected = np.full((num_segments + 1, 2), 0 if operation == "add" else -np.inf, np.float32)
+        ufunc.at(expected, segment[:num], table[row[:num]] + segment[:num, None])
+        np.testing.assert_array_equal(fold(jnp.int32(num)), expected[:-1])
+
+
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize(("size", "num_segments"), [(1, 1), (50, 7), (1003, 20), (4000, 3000)])
 def test_segment_minima_are_those_of_the_valid_values(size, num_segments):
     rng = np.random.default_rng(size)
@@ -130,7 +155,7 @@ def test_fold_points_takes_each_point_of_each_cluster_once(reduce, combine, init
     def update(state, x, y):
         return combine(state, jnp.where(x < 9, jnp.stack([x, y]), initial))
 
-    options = {"absent": (9.0, jnp.zeros(3)), "reduce": getattr(jnp, reduce)}
+    options = {"absent": (9.0, jnp.zeros(3)), "operation": {"sum": "add", "max": "max"}[reduce]}
     init = jnp.full((2, 3), initial, jnp.float32)
     fold = jax.jit(lambda counts: ragged.fold_points(x, y, counts, init, update, **options))
     for counts in ([0, 0, 0], [1, 0, 6], [6, 6, 6], [2, 9, 3]):
@@ -530,7 +555,7 @@ def test_no_chunk_size_changes_a_result(factor, monkeypatch):
         return jax.device_get([
             ragged.fold_points(
                 x, y, jnp.arange(5) * 3, jnp.full(5, -9.0),
-                lambda state, x, _: jnp.maximum(state, x), absent=(-9.0, 0.0), reduce=jnp.max,
+                lambda state, x, _: jnp.maximum(state, x), absent=(-9.0, 0.0), operation="max",
             ),
             runs.fold_runs(update, jnp.zeros(40, jnp.int32), first, length, [jnp.arange(300)]),
             segments.segment_minima(x[:, 0], jnp.arange(11) % 3, y[:, 0] < 1, num_segments=3),

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 
 from jaxbox.stages.state import Kept, Owners
 from jaxbox.types import Descriptors, Hulls
-from jaxbox.xla.loops import fold_rows, map_rows
+from jaxbox.xla.loops import map_rows
 from jaxbox.xla.rows import take
+from jaxbox.xla.segments import fold_segments
 
 MIN_VARIANCE = 1e-6
 """m^2: points on a line have a minor axis of a millimetre rather than none."""
@@ -51,17 +52,14 @@ def point_moments(
     Returns:
       (K, 6) float32: the sums of 1, x, y, x^2, y^2 and x y, about the origin.
     """
-    size = origin.shape[0]
 
-    def add(total: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
-        slot, row = rows
+    def powers(slot: jax.Array, row: jax.Array) -> jax.Array:
         d = take(xy, row) - take(origin, slot)
         x, y = d[:, :1], d[:, 1:]
-        values = jnp.concatenate([jnp.ones_like(x), x, y, x * x, y * y, x * y], axis=1)
-        return total.at[slot].add(values, mode="drop")
+        return jnp.concatenate([jnp.ones_like(x), x, y, x * x, y * y, x * y], axis=1)
 
-    absent = size, xy.shape[0]
-    return fold_rows(add, jnp.zeros((size, 6), jnp.float32), (slot, row), num_rows=num_rows, absent=absent)
+    size = origin.shape[0]
+    return fold_segments("add", powers, slot, row, num_rows=num_rows, num_segments=size, absent=xy.shape[0])
 
 
 def shape_descriptors(moments: jax.Array, hull_area: jax.Array, num_vertices: jax.Array) -> Descriptors:

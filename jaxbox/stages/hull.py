@@ -13,7 +13,7 @@ from jaxbox.xla.hulls import lower_hulls
 from jaxbox.xla.loops import fold_rows, map_rows
 from jaxbox.xla.ragged import PointLists, list_points
 from jaxbox.xla.rows import compact, lookup_each, take
-from jaxbox.xla.segments import argmax_key, argmax_row
+from jaxbox.xla.segments import argmax_key, argmax_row, fold_segments
 
 MIN_EXTENT_M = 1e-6
 """Clusters narrower than this are cut as if they had this width: all their points are in one slice."""
@@ -143,15 +143,14 @@ def find_bounds(
       high: (K, 2) float32, m; likewise, minus infinity.
     """
 
-    def widen(bounds: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
-        slot, row = rows
+    def reach(_: jax.Array, row: jax.Array) -> jax.Array:
         # Low bounds are high ones of the points turned by half a turn.
         point = take(xy, row)
-        return bounds.at[slot].max(jnp.concatenate([point, -point], axis=1), mode="drop")
+        return jnp.concatenate([point, -point], axis=1)
 
-    none = jnp.full((num_clusters, 4), -jnp.inf, jnp.float32)
-    absent = num_clusters, xy.shape[0]
-    bounds = fold_rows(widen, none, (slot, row), num_rows=num_rows, absent=absent)
+    bounds = fold_segments(
+        "max", reach, slot, row, num_rows=num_rows, num_segments=num_clusters, absent=xy.shape[0]
+    )
     return -bounds[:, 2:], bounds[:, :2]
 
 

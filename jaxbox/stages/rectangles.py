@@ -163,18 +163,21 @@ def try_rotations(
 
 
 def _extents(clusters: PointTable, cos: jax.Array, sin: jax.Array) -> jax.Array:
-    # How far the cluster reaches along -u, u, -v and v, in one array.
-    to_x, to_y = jnp.concatenate([-cos, cos, sin, -sin]), jnp.concatenate([-sin, sin, -cos, cos])
+    # Along -u and -v: what is computed along u and v as well, an accelerator would store for all points.
+    minus_cos, minus_sin = -cos, -sin
 
-    def update(reach: jax.Array, x: jax.Array, y: jax.Array) -> jax.Array:
-        return fast_max(reach, _along(x, y, to_x, to_y))
+    def update(reach: tuple[jax.Array, ...], x: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+        back, aside = _along(x, y, minus_cos, minus_sin), _along(x, y, sin, minus_cos)
+        return tuple(
+            fast_max(before, to) for before, to in zip(reach, (back, -back, aside, -aside), strict=True)
+        )
 
     x, y, count = clusters
     # A point that is absent is seen as the first once more; a cluster without any has a first one anyhow.
-    nearest = jnp.full((to_x.shape[0], x.shape[1]), -jnp.inf, jnp.float32)
-    reach = fold_points(x, y, count, nearest, update, absent=(x[0], y[0]), reduce=jnp.max)
-    sign = jnp.array([-1, 1, -1, 1], jnp.float32)[:, None, None]
-    return sign * jnp.where(count > 0, reach, 0).reshape(4, -1, x.shape[1])
+    nearest = jnp.full((cos.shape[0], x.shape[1]), -jnp.inf, jnp.float32)
+    reach = fold_points(x, y, count, (nearest,) * 4, update, absent=(x[0], y[0]), operation="max")
+    low_u, high_u, low_v, high_v = (jnp.where(count > 0, to, 0) for to in reach)
+    return jnp.stack([-low_u, high_u, -low_v, high_v])
 
 
 def _along(x: jax.Array, y: jax.Array, to_x: jax.Array, to_y: jax.Array) -> jax.Array:

@@ -17,6 +17,9 @@ MINIMA_TABLES = 4
 """Tables that points take turns with where a minimum is kept for each cell: neighbours lie in one cell, and a
 processor waits for what it has just written."""
 
+MAX_TABLES, TABLE_NUMBERS = 32, 2**20
+"""Likewise on an accelerator, for whatever is reduced: at most so many tables, of so many numbers."""
+
 PLANES = 32
 """RANSAC hypotheses tried at a time: few enough for their residuals to stay in the cache."""
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
 from jaxbox.xla.barriers import materialize
-from jaxbox.xla.components import CellGrids
+from jaxbox.xla.components import NONE, CellGrids
 from jaxbox.xla.loops import for_chunks, whole_chunks
 
 
@@ -48,14 +48,25 @@ def flag_cells(
         table, flags = state
         part = _chunk(whole, start)
         found = find(materialize(prepare(part)), part, start.astype(jnp.int32) + row < num_rows)
-        # One scatter for all maps reads and writes the flags once, which counts in a batch on an accelerator.
-        for i, cell in enumerate([jnp.stack(found)] if on_accelerator() else found):
+        if on_accelerator():
+            return _write(table, jnp.uint32(0), start, jnp.stack(found)), _flag(
+                flags, jnp.stack(found), cells
+            )
+        for i, cell in enumerate(found):
             flags = flags.at[cells.flag(cell)].set(1, mode="promise_in_bounds")
             table = _write(table, jnp.uint32(i), start, cell)
         return table, flags
 
     table = jnp.zeros((len(cells.shapes), whole_size), jnp.int32)
     return _for_chunks(step, (table, jnp.zeros(cells.num_flags, jnp.uint8)), num_rows, whole_size)
+
+
+def _flag(flags: jax.Array, cell: jax.Array, cells: CellGrids) -> jax.Array:
+    """Flags cells of all maps in one scatter, which reads and writes the flags once.
+
+    Rows that have no cell flag none: an accelerator writes to one place once at a time.
+    """
+    return flags.at[jnp.where(cell == NONE, cells.num_flags, cells.flag(cell))].set(1, mode="drop")
 
 
 def map_tables(

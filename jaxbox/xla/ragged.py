@@ -2,8 +2,8 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -119,7 +119,7 @@ def fold_points(
     update: Callable[[Any, jax.Array, jax.Array], Any],
     *,
     absent: tuple[Any, Any],
-    reduce: Callable[..., jax.Array] = jnp.sum,
+    operation: Literal["add", "max"] = "add",
 ) -> Any:
     """Reduces the points of many clusters to sums or maxima.
 
@@ -138,19 +138,14 @@ def fold_points(
       update: maps the state and x (C,), y (C,) to the next state.
       absent: x and y, () or (C,) each, of the points that a cluster does not have, for a CPU: such that
         `update` makes nothing of them.
-      reduce: static, `jnp.sum` or `jnp.max`, whichever `update` does, and `init` the neutral state of it.
+      operation: static, whichever `update` does, and `init` the neutral state of it.
 
     Returns:
       The state after the last point of each cluster.
     """
     capacity = x.shape[0]
     if on_accelerator():
-        # Points along the last axis, which reductions read without transposing, see `PointLists.table`.
-        of_point = jax.vmap(functools.partial(update, init), out_axes=-1)(x, y)
-        valid = jnp.arange(capacity, dtype=jnp.int32)[None] < count[:, None]
-        return jax.tree.map(
-            lambda values, none: reduce(jnp.where(valid, values, none[..., None]), axis=-1), of_point, init
-        )
+        return _fold_at_once(x, y, count, init, update, operation)
 
     valid, unroll = jnp.arange(capacity, dtype=jnp.int32)[:, None] < count[None], chunks.FOLDED_POINTS
 
@@ -170,3 +165,26 @@ def fold_points(
         return first + unroll, state
 
     return jax.lax.while_loop(lambda loop: loop[0] < most, step, (jnp.int32(0), init))[1]
+
+
+def _fold_at_once(
+    x: jax.Array,
+    y: jax.Array,
+    count: jax.Array,
+    init: Any,
+    update: Callable[[Any, jax.Array, jax.Array], Any],
+    operation: Literal["add", "max"],
+) -> Any:
+    """As `fold_points`: the whole state in one reduction, which reads a point once for all of it."""
+    # Points along the last axis, which reductions read without transposing, see `PointLists.table`.
+    of_point = jax.vmap(functools.partial(update, init), out_axes=-1)(x, y)
+    valid = jnp.arange(x.shape[0], dtype=jnp.int32)[None] < count[:, None]
+    of_point = jax.tree.map(lambda values, none: jnp.where(valid, values, none[..., None]), of_point, init)
+    leaves, tree = jax.tree.flatten(of_point)
+    join, neutral = (jnp.add, 0) if operation == "add" else (jnp.maximum, -jnp.inf)
+
+    def join_all(some: Sequence[jax.Array], others: Sequence[jax.Array]) -> list[jax.Array]:
+        return [join(a, b) for a, b in zip(some, others, strict=True)]
+
+    none = [jnp.asarray(neutral, leaf.dtype) for leaf in leaves]
+    return jax.tree.unflatten(tree, jax.lax.reduce(leaves, none, join_all, (leaves[0].ndim - 1,)))

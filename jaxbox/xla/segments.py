@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,13 @@ import numpy as np
 from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
 from jaxbox.xla.bits import WORD_BITS
+from jaxbox.xla.loops import fold_rows
 
 Columns = Sequence[jax.Array]
 """What is reduced of a row: numbers () each, or (N,) of all rows."""
+
+_NEUTRAL = {"add": 0, "max": -jnp.inf, "min": jnp.inf}
+_JOINED = {"add": jnp.sum, "max": jnp.max, "min": jnp.min}
 
 
 def reduce_segments(
@@ -84,11 +88,38 @@ def _reduce_parallel(
     row = jnp.where(valid, segment, table.shape[0])
     own = jnp.broadcast_to(_as_row(describe(rows)), (*row.shape, table.shape[1]))
     num_maxima = int(is_maximum.sum())
-    maxima = table[:, :num_maxima].at[row].max(own[..., :num_maxima], mode="drop")
+    maxima = _scatter_in_turn("max", row, own[..., :num_maxima], num_segments=table.shape[0])
     # Whole numbers: ordered scatters of floats cost accelerators more.
-    sums = jnp.zeros((table.shape[0], table.shape[1] - num_maxima), jnp.int32)
-    sums = sums.at[row].add(own[..., num_maxima:].astype(jnp.int32), mode="drop")
+    whole = own[..., num_maxima:].astype(jnp.int32)
+    sums = _scatter_in_turn("add", row, whole, num_segments=table.shape[0])
     return jnp.concatenate([maxima, sums.astype(jnp.float32)], axis=1)
+
+
+def _scatter_in_turn(
+    operation: Literal["add", "max", "min"], segment: jax.Array, values: jax.Array, *, num_segments: int
+) -> jax.Array:
+    """Sums, maxima or minima of the rows of each segment, on an accelerator.
+
+    It changes a number in memory by one row after the other, and neighbouring rows are often of one segment:
+    so they go to several tables in turn, which are joined. There are as many tables as cost little.
+
+    Args:
+      operation: what to do with the rows.
+      segment: (..., N) int32, in [0, num_segments]; the latter for none.
+      values: (..., N, C), float32 for maxima and minima.
+      num_segments: static, S.
+
+    Returns:
+      (S, C): 0, or infinite, where a segment has no row.
+    """
+    columns = values.shape[-1]
+    num_tables = max(min(chunks.MAX_TABLES, chunks.TABLE_NUMBERS // max(num_segments * columns, 1)), 1)
+    table = jax.lax.broadcasted_iota(jnp.int32, segment.shape, segment.ndim - 1) % num_tables
+    # What lies past the last segment would be another table's.
+    place = jnp.where(segment < num_segments, table * num_segments + segment, num_tables * num_segments)
+    tables = jnp.full((num_tables * num_segments, columns), _NEUTRAL[operation], values.dtype)
+    filled = getattr(tables.at[place], operation)(values, mode="drop")
+    return _JOINED[operation](filled.reshape(num_tables, num_segments, columns), axis=0)
 
 
 def _as_row(columns: tuple[Columns, Columns]) -> jax.Array:
@@ -99,6 +130,42 @@ def _as_row(columns: tuple[Columns, Columns]) -> jax.Array:
     for k, value in enumerate(values[:-1]):
         row = jnp.where(column == k, value[..., None], row)
     return row
+
+
+def fold_segments(
+    operation: Literal["add", "max"],
+    describe: Callable[[jax.Array, jax.Array], jax.Array],
+    segment: jax.Array,
+    row: jax.Array,
+    *,
+    num_rows: jax.Array,
+    num_segments: int,
+    absent: int,
+) -> jax.Array:
+    """Sums or maxima over the rows of each segment. Law: `jax.ops.segment_sum`, `segment_max`.
+
+    Args:
+      operation: static, sums or maxima.
+      describe: gives the numbers (N, C) of rows, of their segments and themselves, (N,) each.
+      segment: (N,) int32, in [0, S]; the latter for none.
+      row: (N,) int32, what `describe` looks up.
+      num_rows: () int32; how many rows count, from the first on.
+      num_segments: static, S.
+      absent: static, a row that `describe` finds nothing at.
+
+    Returns:
+      (S, C) float32: 0, or minus infinity, where a segment has no row.
+    """
+    shape = jax.eval_shape(describe, segment, row).shape
+    none = jnp.full((num_segments, shape[1]), _NEUTRAL[operation], jnp.float32)
+
+    def fold(table: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
+        values = describe(*rows)
+        if on_accelerator():
+            return _scatter_in_turn(operation, rows[0], values, num_segments=num_segments)
+        return getattr(table.at[rows[0]], operation)(values, mode="drop")
+
+    return fold_rows(fold, none, (segment, row), num_rows=num_rows, absent=(num_segments, absent))
 
 
 def segment_minima(
@@ -115,6 +182,9 @@ def segment_minima(
     Returns:
       (S,) float32, infinite where there is none.
     """
+    if on_accelerator():
+        segment = jnp.where(valid, segment, num_segments)
+        return _scatter_in_turn("min", segment, values[:, None], num_segments=num_segments)[:, 0]
     table = jnp.arange(values.shape[0], dtype=jnp.int32) % chunks.MINIMA_TABLES
     num_places = chunks.MINIMA_TABLES * num_segments
     # What lies past the last segment would be another table's.
