@@ -24,6 +24,7 @@ import numpy as np
 from jaxbox._box import ByValue, Detection
 from jaxbox._box_rows import BoxRows, later_module
 from jaxbox._padding import aligned_empty, checked_points, fill_rows, fitting_capacity
+from jaxbox._transfer import to_host
 from jaxbox.config import DetectorConfig
 from jaxbox.config import Label as Label  # noqa: PLC0414 - one of the types that users hold
 from jaxbox.config.capacities import CAPACITIES, CLOUD_CAPACITY, Capacity
@@ -96,21 +97,6 @@ def combine_bits(bits: Mapping[Any, jax.Array]) -> jax.Array:
       () int32.
     """
     return sum((jnp.where(is_set, jnp.int32(bit), 0) for bit, is_set in bits.items()), jnp.int32(0))
-
-
-def to_host(tree: Any, status: jax.Array) -> Any:
-    """A tree in NumPy arrays: on a CPU views of JAX's own memory, from an accelerator in one transfer.
-
-    Args:
-      tree: of arrays.
-      status: one of them.
-
-    Returns:
-      The same tree.
-    """
-    devices = status.devices() if isinstance(status, jax.Array) else ()
-    on_cpu = all(device.platform == "cpu" for device in devices)
-    return jax.tree.map(np.asarray, tree) if on_cpu else jax.device_get(tree)
 
 
 class Motion(enum.IntEnum):

@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 
 from jaxbox._box import ByValue
 from jaxbox._padding import fitting_capacity
+from jaxbox._transfer import to_host
 from jaxbox.config import DetectorConfig
 from jaxbox.config.capacities import CAPACITIES
 from jaxbox.config.checks import check_config
@@ -21,7 +22,7 @@ from jaxbox.run.arguments import as_config, as_key, as_points
 from jaxbox.run.compiled import PackedConfig
 from jaxbox.stages import clustering, filtering, ground, rectangles
 from jaxbox.stages.state import Ground, Obstacles, Outlines, Sweep
-from jaxbox.types import GroundPlane, PointCloud, to_host
+from jaxbox.types import GroundPlane, PointCloud
 from jaxbox.xla.backend import building_for, on_accelerator
 from jaxbox.xla.barriers import outline
 from jaxbox.xla.ragged import PointLists
