@@ -2,9 +2,9 @@
 
 KITTI's sweeps are thinned to every second and every fourth beam, as sensors of 32 and 16 beams over the same
 field of view would have seen them; any of the beams may be the first, so there are several such sweeps. The
-fitted values gain on both sets of frames, whose drives differ, so that either confirms what the other would
-have chosen. Labels stay those of 64 beams: a car that hardly holds a point any more counts as missed. Average
-precision is a share of what perfect answers reach on these few labels.
+fitted values gain on both sets of frames. That is no proof: both were looked at, and share eight drives.
+Labels stay those of 64 beams: a car that hardly holds a point any more counts as missed. Average precision is
+a share of what perfect answers reach on these few labels.
 
 More than 64 beams are only to be had from `jaxbox.synthetic`, whose scenes no value was chosen on.
 
@@ -30,7 +30,7 @@ from jaxbox.io import open_sweeps
 from jaxbox.synthetic import SyntheticSweep, make_sweep
 
 SETS: Mapping[str, str] = {"20 frames": "kitti_object", "58 frames": "kitti_object_more"}
-"""Folders of labelled sweeps, of different drives."""
+"""Folders of labelled sweeps; eight drives are in both."""
 FIRSTS: Mapping[int, tuple[int, ...]] = {64: (0,), 32: (0, 1), 16: (0, 2)}
 """The first beam that is kept: several sensors of that many beams in one sweep."""
 DENSEST = 128

@@ -107,7 +107,7 @@ class BoxRows(ByValue, Generic[AnyBox]):
           Those boxes.
 
         Raises:
-          ValueError: for an unknown class, naming the known ones.
+          ValueError: for an unknown class, naming the known ones; for two names of one class.
         """
         host = _one_sweep(self)
         return self[reaches(host.score, host.label, score)]
@@ -322,12 +322,16 @@ def reaches(score: Any, label: Any, least: float | ScoreByClass) -> np.ndarray:
       (n,) bool.
 
     Raises:
-      ValueError: for an unknown class.
+      ValueError: for an unknown class, or two names of one class.
     """
     score = np.asarray(score)
     if not isinstance(least, Mapping):
         return score >= least
-    known = {_label(name): value for name, value in least.items()}
+    known: dict[Label, float] = {}
+    for name, value in least.items():
+        if (named := _label(name)) in known:
+            raise ValueError(f"{name!r} is {named.word!r} again: give one score a class.")
+        known[named] = value
     table = np.array([known.get(each, -np.inf) for each in Label], score.dtype)
     return score >= table[np.asarray(label)]
 

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 import jaxbox
 from jaxbox import synthetic
 from jaxbox.cli import app
-from jaxbox.cli.tune import frame_groups, time_left
+from jaxbox.cli.tune import drive_files, frame_groups, time_left
 from jaxbox.io import (
     objects_from_detections,
     open_sweeps,
@@ -136,30 +136,64 @@ def test_without_drives_each_sweep_is_left_out_and_the_report_says_so(kitti_fold
         assert "Keep the base" in text
 
 
+def copy_sweeps(kitti_folder, root, names, chosen):
+    """Some of the sweeps in another folder, under other names, and the drives beside them."""
+    for folder, suffix in (("velodyne", "bin"), ("calib", "txt"), ("label_2", "txt")):
+        (root / "training" / folder).mkdir(parents=True)
+        for name, old in zip(names, chosen, strict=True):
+            target = root / "training" / folder / f"{name}.{suffix}"
+            shutil.copy(kitti_folder / folder / f"{old}.{suffix}", target)
+    (root / "drives.txt").write_text("".join(f"{name} drive_{root.name} 5\n" for name in names))
+
+
+def group_sizes(output):
+    return {row["group"]: row["num_frames"] for row in read_report(output)["held_out"]["groups"]}
+
+
 def test_several_folders_are_pooled_and_grouped_by_the_drives_beside_them(kitti_folder, tmp_path):
     names = [f"{seed:06d}" for seed in range(NUM_SWEEPS)]
-    for root, chosen in (("one", names[:1]), ("two", names[1:])):
-        for folder, suffix in (("velodyne", "bin"), ("calib", "txt"), ("label_2", "txt")):
-            (tmp_path / root / "training" / folder).mkdir(parents=True)
-            for name in chosen:
-                file = f"{folder}/{name}.{suffix}"
-                shutil.copy(kitti_folder / file, tmp_path / root / "training" / file)
-        (tmp_path / root / "drives.txt").write_text("".join(f"{name} drive_{root} 5\n" for name in chosen))
-    both = ("--labels", tmp_path / "one")
-    result = tune(tmp_path / "two" / "training", tmp_path / "tune", "--trials", 1, *both)
+    copy_sweeps(kitti_folder, tmp_path / "one", names[:1], names[:1])
+    # A frame of this folder has the name of one of the other's.
+    copy_sweeps(kitti_folder, tmp_path / "two", names[:-1], names[1:])
+    both = ("--labels", tmp_path / "one", "--trials", 1)
+    result = tune(tmp_path / "two" / "training", tmp_path / "tune", *both)
     assert result.exit_code == 0, result.output
     report = read_report(tmp_path / "tune")
     assert (report["num_frames"], report["group_kind"]) == (NUM_SWEEPS, "drive")
-    rows = {row["group"]: row["num_frames"] for row in report["held_out"]["groups"]}
-    assert rows == {"drive_one": 1, "drive_two": NUM_SWEEPS - 1}
+    assert group_sizes(tmp_path / "tune") == {"drive_one": 1, "drive_two": NUM_SWEEPS - 1}
+    assert "taken for one drive" not in result.stdout
     (tmp_path / "one" / "drives.txt").unlink()
+    result = tune(tmp_path / "two", tmp_path / "half", *both)
+    assert result.exit_code == 0, result.output
+    assert group_sizes(tmp_path / "half") == {"training": 1, "drive_two": NUM_SWEEPS - 1}
+    note = f"No drives.txt is with {tmp_path / 'one'}: each folder or recording is taken for one drive."
+    assert note in (tmp_path / "half" / "report.md").read_text()
+    (tmp_path / "two" / "drives.txt").write_text(f"{names[0]} drive_two\n")
     refused = tune(tmp_path / "two", tmp_path / "none", *both)
     assert refused.exit_code == 2
-    assert "no drive for 1 of 3 frames" in refused.stderr
-    (tmp_path / "two" / "drives.txt").unlink()
-    kind, groups = frame_groups(open_sweeps([tmp_path / "one", tmp_path / "two"]), names, [])
+    assert "no drive for 1 of 2 frames, the first is 000001" in refused.stderr
+
+
+def test_frames_of_one_name_have_the_drives_of_their_folders(kitti_folder, tmp_path):
+    names = [f"{seed:06d}" for seed in range(NUM_SWEEPS)]
+    for folder, number in (("one", 1), ("two", 2)):
+        copy_sweeps(kitti_folder, tmp_path / folder, names[:number], names[:number])
+    folders = [tmp_path / "one", tmp_path / "two"]
+    sweeps = open_sweeps(folders)
+    pooled = [sweep.name for sweep in sweeps]
+    assert pooled == ["one_training_velodyne_000000", "two_training_velodyne_000000", "000001"]
+    by_drive = ["drive_one", "drive_two", "drive_two"]
+    assert frame_groups(sweeps, pooled, drive_files(folders, None)) == (
+        "drive",
+        dict(zip(pooled, by_drive, strict=True)),
+    )
+    given = tmp_path / "given.txt"
+    given.write_text("".join(f"{name} {drive}\n" for name, drive in zip(pooled, "aba", strict=True)))
+    groups = frame_groups(sweeps, pooled, drive_files(folders, given))
+    assert groups == ("drive", dict(zip(pooled, "aba", strict=True)))
+    kind, groups = frame_groups(sweeps, pooled, dict.fromkeys(folders))
     assert kind == "folder"
-    assert groups[names[0]] != groups[names[1]] == groups[names[2]]
+    assert groups[pooled[0]] != groups[pooled[1]] == groups[pooled[2]]
 
 
 def interrupt_at(monkeypatch, index):

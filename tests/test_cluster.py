@@ -140,8 +140,13 @@ def test_same_names_get_their_folder_and_what_is_no_sweep_is_refused(tmp_path):
         memory.pipe(f"/{name}", b"")
     names = [ref.name for ref in list_sweeps(["memory://a"], None, serially)]
     assert names == ["x_1", "y_1", "2"]
-    with pytest.raises(io.InputError, match="would be named y_1"):
-        list_sweeps(["memory://a", "memory://b"], None, serially)
+    names = [ref.name for ref in list_sweeps(["memory://a", "memory://b"], None, serially)]
+    assert names == ["x_1", "a_y_1", "2", "b_y_1"]
+    memory.pipe("/a_b/1.bin", b"")
+    memory.pipe("/a/b/1.bin", b"")
+    memory.pipe("/b/1.bin", b"")
+    with pytest.raises(io.InputError, match="would be named a_b_1"):
+        list_sweeps(["memory://a_b/1.bin", "memory://a/b/1.bin", "memory://b/1.bin"], None, serially)
     with pytest.raises(io.InputError, match="memory://c: no points there"):
         list_sweeps(["memory://c"], None, serially)
     with pytest.raises(io.InputError, match="nosuch://a: cannot be opened"):

@@ -21,7 +21,10 @@ def test_each_frame_gets_its_drive_in_the_order_asked_for(tmp_path):
     [
         ("000001 a\n000002\n", "line 2: 1 words"),
         ("000001 a 7 b\n", "line 1: 4 words"),
-        ("000001 a\n\n000001 a\n", "line 3: frame 000001 stands there twice"),
+        (
+            "000001 a\n\n000001 a\n",
+            r"line 3: frame 000001 has a drive already, by .*drives\.txt, line 1; remove",
+        ),
         ("000009 a\n", "no drive for 2 of 2 frames, the first is 000001"),
     ],
 )
@@ -39,8 +42,10 @@ def test_several_files_are_one_table(tmp_path):
     files = [find_drives(tmp_path / name) for name in ("one", "two")]
     assert read_drives(files, ["000001", "000002"]) == {"000001": "a", "000002": "b"}
     write(tmp_path / "two", "000001 b\n")
-    with pytest.raises(InputError, match=f"{files[1]}, line 1: frame 000001 stands there twice"):
+    twice = f"{files[1]}, line 1: frame 000001 has a drive already, by {files[0]}, line 1; remove one"
+    with pytest.raises(InputError, match=twice):
         read_drives(files, ["000001"])
+    assert read_drives([files[1], str(files[1])], ["000001"]) == {"000001": "b"}
 
 
 def test_the_file_is_found_in_the_folder_or_beside_it(tmp_path):

@@ -543,9 +543,14 @@ def test_patterns_and_several_paths_are_taken_and_names_stay_apart(tmp_path):
     assert [s.name for s in io.open_sweeps(tmp_path / "a" / "*.npy")] == ["1", "2"]
     assert [s.name for s in io.open_sweeps(tmp_path / "*" / "1.npy")] == ["a_1", "b_1"]
     assert [s.name for s in io.open_sweeps([tmp_path / "a", tmp_path / "b" / "2.npy"])] == ["1", "a_2", "b_2"]
+    for drive in ("a", "b"):
+        (tmp_path / drive / "velodyne").mkdir()
+        np.save(tmp_path / drive / "velodyne" / "1.npy", XYZ)
+    folders = [tmp_path / drive / "velodyne" for drive in ("a", "b")]
+    assert [s.name for s in io.open_sweeps(folders)] == ["a_velodyne_1", "b_velodyne_1"]
     with pytest.raises(io.InputError, match=r"\*\.las: no file or folder is of this pattern"):
         io.open_sweeps(tmp_path / "*.las")
-    with pytest.raises(io.InputError, match=r"would be named a_1, as that of"):
+    with pytest.raises(io.InputError, match=r"1\.npy: given twice, by itself or by a folder that holds it"):
         io.open_sweeps([tmp_path / "a", tmp_path / "a" / "1.npy"])
     with pytest.raises(io.InputError, match="no path was given"):
         io.open_sweeps([])

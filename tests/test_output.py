@@ -62,6 +62,15 @@ def test_a_least_score_that_cannot_be_says_so(text, words):
     assert words in str(error.value)
 
 
+def test_a_filter_does_not_change_with_what_it_was_made_of():
+    scores = {"van": 0.2}
+    keep = BoxFilter.chosen(classes="cars", within="30", min_scores=scores)
+    same = BoxFilter.chosen(classes="car", within="30", min_scores=dict(scores))
+    scores["van"] = 0.9
+    assert keep == same
+    assert hash(keep) == hash(same)
+
+
 def test_a_class_that_is_named_may_have_a_lower_score_than_the_others():
     assert parse_min_score("0.3, Cars = 0.1") == (0.1, {"car": 0.1, "van": 0.3, "truck": 0.3})
     assert parse_min_score("van=0.2") == (0.0, {"car": 0.0, "van": 0.2, "truck": 0.0})

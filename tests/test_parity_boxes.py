@@ -314,6 +314,8 @@ def test_the_second_peak_of_a_curve_is_far_from_the_best_and_nearly_as_good(plat
     assert (left.max(axis=0) > curve.max(axis=0) - 0.03).all()
     without = np.asarray(second_peak(curve, num_points, max_loss=np.float32(0)))
     np.testing.assert_array_equal(without, curve)
+    same = [reference.second_peak(*each, max_loss=0.0) for each in zip(curve.T, num_points, strict=True)]
+    np.testing.assert_array_equal(np.stack(same, axis=1), curve)
 
 
 @pytest.mark.usefixtures("platform")

@@ -80,6 +80,9 @@ def test_on_one_ground_plane_both_find_the_same_boxes_of_the_same_points(cases, 
     bad, total = missing(pairs)
     assert total > 15
     parity.assert_share(bad, total, 0.02, f"boxes of {preset}, on one plane")
+    # A component that one cell joins otherwise takes its points along.
+    slab = np.array([(ours.counts.slab_points, theirs.counts["slab_points"]) for ours, theirs in pairs])
+    parity.assert_share(np.abs(slab @ [1, -1]).sum(), slab[:, 0].sum(), 0.03, f"slab points of {preset}")
     for ours, theirs in pairs:
         count = len(theirs.ground_mask)
         ground = ours.ground_mask[:count] != theirs.ground_mask

@@ -154,6 +154,9 @@ def test_filters_keep_what_they_say(found):
     ]
     with pytest.raises(ValueError, match="'bus' is not a class"):
         found.above({"bus": 0.5})
+    for names in (("car", "cars"), (Label.CAR, "Car")):
+        with pytest.raises(ValueError, match=f"{names[1]!r} is 'car' again: give one score a class"):
+            found.above(dict.fromkeys(names, 0.5))
 
 
 def test_a_filter_keeps_rows_and_leaves_the_points_of_other_boxes_to_none(found):

@@ -165,6 +165,9 @@ def test_corners_are_the_entries_of_two_by_two_cells(num_places):
     found = jax.jit(functools.partial(rows.lookup_corners))(table, i, j)
     expected = [table[i, j], table[i, j + 1], table[i + 1, j], table[i + 1, j + 1]]
     np.testing.assert_array_equal(found, expected)
+    tables = np.stack([table, -table])
+    batched = jax.jit(jax.vmap(rows.lookup_corners))(tables, np.stack([i, i]), np.stack([j, j]))
+    np.testing.assert_array_equal(batched, [(corner, -corner) for corner in expected])
 
 
 @pytest.mark.usefixtures("platform")

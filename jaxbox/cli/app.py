@@ -316,7 +316,7 @@ def tune(
     """Search settings on labelled sweeps, and evaluate them on held-out drives.
 
     Thresholds are traced: every trial runs in one compiled program. Each drive is scored with the setting
-    that the other drives chose. Interrupted, it reports what is done and ends with exit code 1. Use the
+    that the other drives chose. Interrupted, it reports what is done and ends with exit code 130. Use the
     result with `jaxbox detect --config OUTPUT/best.json`.
     """
     with input_errors():

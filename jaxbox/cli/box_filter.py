@@ -43,8 +43,8 @@ class BoxFilter:
     """`Label.word` of each class; None is all."""
     within: float | tuple[tuple[float, ...], ...] | None = None
     """Radius from the sensor, m, or the corners of a polygon, m, sensor frame; None is everywhere."""
-    min_scores: Mapping[str, float] = dataclasses.field(default_factory=dict)
-    """Least score of some classes, by `Label.word`."""
+    min_scores: tuple[tuple[str, float], ...] = ()
+    """`Label.word` and least score of some classes."""
 
     @classmethod
     def chosen(
@@ -63,7 +63,7 @@ class BoxFilter:
         return cls(
             None if classes is None else _parse_classes(classes),
             None if within is None else _parse_area(within),
-            min_scores or {},
+            tuple((min_scores or {}).items()),
         )
 
     def recorded(self) -> dict[str, Any]:
@@ -82,7 +82,7 @@ class BoxFilter:
         center = np.asarray(boxes.center, np.float64)
         if self.classes is not None:
             keep &= np.isin(boxes.label, [label.value for label in Label if label.word in self.classes])
-        keep &= reaches(boxes.score, boxes.label, self.min_scores)
+        keep &= reaches(boxes.score, boxes.label, dict(self.min_scores))
         if isinstance(self.within, tuple):
             keep &= in_polygon(center, self.within)
         elif self.within is not None:

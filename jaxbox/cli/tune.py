@@ -6,7 +6,7 @@ import datetime
 import json
 import pathlib
 import statistics
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -78,7 +78,8 @@ def run_tune(labels: Sequence[pathlib.Path], options: TuneOptions, console: Cons
       InputError: where labels or options cannot be used.
     """
     axes = chosen_axes(options)
-    bench = make_bench(labels, options)
+    drives = drive_files(labels, options.drives)
+    bench = make_bench(labels, options, drives)
     options.output.mkdir(parents=True, exist_ok=True)
     compiled_before = count_compilations()
     console.print(f"compiling the detector for {bench.capacity} points")
@@ -107,7 +108,8 @@ def run_tune(labels: Sequence[pathlib.Path], options: TuneOptions, console: Cons
         "num_planned": options.trials,
         "preset": options.preset,
         "base_changes": changed_fields(options.config, DetectorConfig.presets()[options.preset]),
-        "drives": [str(file) for file in drive_files(labels, options.drives)],
+        "drives": [str(file) for file in dict.fromkeys(drives.values()) if file is not None],
+        "folders_without_drives": [str(folder) for folder, file in drives.items() if file is None],
         "seed": options.seed,
         "compile_s": compile_s,
         "num_compilations": count_compilations() - compiled_before,
@@ -148,7 +150,9 @@ def chosen_axes(options: TuneOptions) -> list[Axis]:
     return axes
 
 
-def make_bench(labels: Sequence[pathlib.Path], options: TuneOptions) -> Bench:
+def make_bench(
+    labels: Sequence[pathlib.Path], options: TuneOptions, drives: Mapping[pathlib.Path, pathlib.Path | None]
+) -> Bench:
     """Reads the labelled sweeps, and the groups in which they are held out.
 
     Raises:
@@ -161,7 +165,7 @@ def make_bench(labels: Sequence[pathlib.Path], options: TuneOptions) -> Bench:
             f"{', '.join(map(str, labels))}: no sweep there has labels and a calibration; give a labelled "
             "KITTI folder."
         )
-    kind, groups = frame_groups(sweeps, [frame.name for frame in frames], drive_files(labels, options.drives))
+    kind, groups = frame_groups(sweeps, [frame.name for frame in frames], drives)
     return Bench(
         base=options.config,
         frames=frames,
@@ -172,46 +176,67 @@ def make_bench(labels: Sequence[pathlib.Path], options: TuneOptions) -> Bench:
     )
 
 
-def drive_files(labels: Sequence[pathlib.Path], given: pathlib.Path | None) -> list[pathlib.Path]:
-    """The files that say which drive a frame is of.
+def drive_files(
+    labels: Sequence[pathlib.Path], given: pathlib.Path | None
+) -> dict[pathlib.Path, pathlib.Path | None]:
+    """The file that says which drive a frame is of, for each folder.
 
     Args:
       labels: folders of labelled sweeps.
-      given: the file that the user named, or None.
+      given: the file that the user named, for all of them; or None.
 
     Returns:
-      That file; else the ``drives.txt`` in or beside each of the folders that has one.
+      That file; else the ``drives.txt`` in or beside the folder, None where there is none.
     """
-    if given is not None:
-        return [given]
-    return list(dict.fromkeys(file for folder in labels if (file := find_drives(folder)) is not None))
+    return {folder: given or find_drives(folder) for folder in labels}
 
 
 def frame_groups(
-    sweeps: Sequence[Sweep], names: Sequence[str], files: Sequence[pathlib.Path]
+    sweeps: Sequence[Sweep],
+    names: Sequence[str],
+    drives: Mapping[pathlib.Path, pathlib.Path | None],
 ) -> tuple[str, dict[str, str]]:
     """What is held out together: drives as files say them, else the sweeps of one folder or recording.
 
     Args:
       sweeps: all sweeps.
       names: those of them that have labels.
-      files: from `drive_files`.
+      drives: from `drive_files`.
 
     Returns:
       What a group is, in a word, and the group of each frame. Where all sweeps lie in one folder and no file
       says their drives, each sweep is a group.
 
     Raises:
-      InputError: where there are files and one of the frames has no drive in them.
+      InputError: where a folder has a file and one of its frames has no drive in it.
     """
-    if files:
-        return "drive", read_drives(files, names)
-    sequences = group_sequences(sweeps)
-    folder_of = {sweep.name: name for name, sequence in sequences for sweep in sequence}
-    folders = {name: folder_of[name] for name in names}
+    paths = {sweep.name: sweep.points_path for sweep in sweeps}
+    if any(drives.values()):
+        labelled = {paths[name] for name in names}
+        drive_of: dict[pathlib.Path, str] = {}
+        for file in dict.fromkeys(drives.values()):
+            folders = [folder for folder in drives if drives[folder] == file]
+            found = open_sweeps(folders)
+            drive_of |= _folder_groups(found) if file is None else _drives_in(file, found, labelled)
+        return "drive", {name: drive_of[paths[name]] for name in names}
+    folder_of = _folder_groups(sweeps)
+    folders = {name: folder_of[paths[name]] for name in names}
     if len(set(folders.values())) > 1:
         return "folder", folders
     return "sweep", {name: name for name in names}
+
+
+def _drives_in(
+    file: pathlib.Path, sweeps: Sequence[Sweep], labelled: Collection[pathlib.Path]
+) -> dict[pathlib.Path, str]:
+    """The drive of each labelled sweep; the file names them as these sweeps are named."""
+    path_of = {sweep.name: sweep.points_path for sweep in sweeps if sweep.points_path in labelled}
+    return {path_of[name]: drive for name, drive in read_drives(file, path_of).items()}
+
+
+def _folder_groups(sweeps: Sequence[Sweep]) -> dict[pathlib.Path, str]:
+    """The folder or recording of each sweep, by the path of its points."""
+    return {sweep.points_path: name for name, group in group_sequences(sweeps) for sweep in group}
 
 
 def run_trials(
@@ -286,8 +311,11 @@ def run_notes(report: dict[str, Any]) -> list[str]:
     """Sentences on how the search was run."""
     done, planned = len(report["trials"]), report["num_planned"]
     ended = "interrupted; " if report["interrupted"] else ""
+    drives = f"Drives are those of {', '.join(report['drives'])}."
+    if whole := ", ".join(report["folders_without_drives"]):
+        drives += f" No drives.txt is with {whole}: each folder or recording is taken for one drive."
     groups = {
-        "drive": f"Drives are those of {', '.join(report['drives'])}.",
+        "drive": drives,
         "folder": "No file says which drive a frame is of, so each folder or recording is taken for one.",
         "sweep": "No drives were given, so each sweep was held out by itself: sweeps of a drive resemble "
         "each other, and the held-out figures are flattered.",

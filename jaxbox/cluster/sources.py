@@ -1,6 +1,5 @@
 """Where the sweeps of an archive lie: listed by the driver and its tasks, read by the workers."""
 
-import collections
 import contextlib
 import dataclasses
 import itertools
@@ -16,7 +15,7 @@ from jaxbox import io
 from jaxbox._extras import require
 from jaxbox.io.points import Points, TimedPoints
 from jaxbox.io.registry import POINT_FORMATS, format_of
-from jaxbox.io.sweeps import sweep_of
+from jaxbox.io.sweeps import distinct_names, sweep_of
 
 _NOWHERE = pathlib.Path("/no/such/folder")
 """Remote paths are named as if they lay below it, where no local file can be taken for theirs."""
@@ -232,14 +231,9 @@ def _named(url: str) -> SweepRef:
 
 
 def _distinct(refs: list[SweepRef]) -> list[SweepRef]:
-    """As `jaxbox.io.open_sweeps`: where two have one name, the folder's stands before it."""
-    counts = collections.Counter(ref.name for ref in refs)
-    named = [
-        dataclasses.replace(ref, name=f"{_path_of(ref.url).parent.name}_{ref.name}")
-        if counts[ref.name] > 1
-        else ref
-        for ref in refs
-    ]
+    """As `jaxbox.io.open_sweeps`: where several have one name, folders stand before it."""
+    names = distinct_names([(_path_of(ref.url).parent, ref.name) for ref in refs])
+    named = [dataclasses.replace(ref, name=name) for ref, name in zip(refs, names, strict=True)]
     first: dict[str, str] = {}
     for ref in named:
         if ref.name in first:

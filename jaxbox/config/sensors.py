@@ -3,7 +3,7 @@
 The presets were chosen on sweeps of 64 beams. With fewer, the same car holds fewer points, and the rings on
 the ground lie farther apart. Which settings that moves, and how far, was measured on KITTI sweeps thinned to
 every second and every fourth beam (`jaxbox.evaluation.thin_beams`): what is kept gains on both of two sets of
-frames, whose drives differ: ``python -m benchmarks.bench_beams``.
+frames, which share eight of their drives: ``python -m benchmarks.bench_beams``.
 """
 
 import dataclasses

@@ -42,13 +42,16 @@ def read_drives(path: PathLike | Sequence[PathLike], names: Iterable[str]) -> di
       The drive of each of these frames, in their order.
 
     Raises:
-      InputError: naming file and line for a line of other words or a frame that stands twice;
-        naming the first frame that is missing.
+      InputError: naming file and line for a line of other words, and both places of a frame that stands
+        twice; naming the first frame that is missing.
     """
-    paths = [path] if isinstance(path, str | os.PathLike) else list(path)
+    given = [path] if isinstance(path, str | os.PathLike) else path
+    # Two folders may share a file, which is read once.
+    paths = list(dict.fromkeys(map(pathlib.Path, given)))
     drives: dict[str, str] = {}
+    places: dict[str, str] = {}
     for file in paths:
-        _read_file(file, drives)
+        _read_file(file, drives, places)
     names = list(names)
     missing = [name for name in names if name not in drives]
     if missing:
@@ -59,19 +62,19 @@ def read_drives(path: PathLike | Sequence[PathLike], names: Iterable[str]) -> di
     return {name: drives[name] for name in names}
 
 
-def _read_file(path: PathLike, drives: dict[str, str]) -> None:
-    """Adds the frames of one file to those of the files before it."""
+def _read_file(path: pathlib.Path, drives: dict[str, str], places: dict[str, str]) -> None:
+    """Adds the frames of one file, and where they stand, to those of the files before it."""
     for number, line in enumerate(read_text(path).splitlines(), 1):
         words = line.partition(_COMMENT)[0].split()
         if not words:
             continue
+        place = f"{path}, line {number}"
         if len(words) not in _COLUMNS:
-            raise InputError(
-                f"{path}, line {number}: {len(words)} words; write the frame, a space, its drive."
-            )
+            raise InputError(f"{place}: {len(words)} words; write the frame, a space, its drive.")
         frame, drive = words[:2]
         if frame in drives:
             raise InputError(
-                f"{path}, line {number}: frame {frame} stands there twice; keep one of the lines."
+                f"{place}: frame {frame} has a drive already, by {places[frame]}; remove one of the "
+                "two lines."
             )
-        drives[frame] = drive
+        drives[frame], places[frame] = drive, place

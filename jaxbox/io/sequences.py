@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from jaxbox.io.levelled import LevelSweeps
 from jaxbox.io.recordings import RecordedSweeps
 from jaxbox.io.sweep import Sweep
-from jaxbox.io.sweeps import ChainedSweeps
+from jaxbox.io.sweeps import ChainedSweeps, distinct_names
 
 _UNNAMED = "sequence"
 """Of sweeps whose folder has no name, as the root of a file system."""
@@ -30,7 +30,7 @@ def group_sequences(sweeps: Sequence[Sweep]) -> list[tuple[str, Sequence[Sweep]]
       them, and keep their order otherwise; sweeps of one time stay side by side.
     """
     groups = _groups(sweeps)
-    names = _distinct_names([(path, name) for path, name, _ in groups])
+    names = distinct_names([(path, name) for path, name, _ in groups])
     return [(name, group) for name, (_, _, group) in zip(names, groups, strict=True)]
 
 
@@ -55,16 +55,3 @@ def _by_time(sweeps: list[Sweep]) -> list[Sweep]:
     if any(sweep.timestamp_ns is None for sweep in sweeps):
         return sweeps
     return sorted(sweeps, key=lambda sweep: sweep.timestamp_ns or 0)
-
-
-def _distinct_names(places: list[tuple[pathlib.Path, str]]) -> list[str]:
-    """The names; where two are the same, as many folders before them as tell them apart."""
-    names, depth = [name for _, name in places], 0
-    while len(set(names)) < len(names) and depth < max(len(path.parts) for path, _ in places):
-        depth += 1
-        counts = collections.Counter(names)
-        names = [
-            "_".join([*path.parts[-depth:], given]).replace("/", "") if counts[name] > 1 else name
-            for name, (path, given) in zip(names, places, strict=True)
-        ]
-    return names

@@ -180,21 +180,41 @@ def recording_format(path: pathlib.Path) -> RecordingFormat | None:
 
 
 def _distinct(sweeps: list[Sweep]) -> tuple[Sweep, ...]:
-    """The sweeps; where two have one name, as in different folders, the folder's stands before it."""
-    counts = collections.Counter(sweep.name for sweep in sweeps)
-    named = tuple(
-        dataclasses.replace(sweep, name=f"{sweep.points_path.parent.name}_{sweep.name}")
-        if counts[sweep.name] > 1
-        else sweep
-        for sweep in sweeps
-    )
-    _check_distinct([sweep.name for sweep in named], [sweep.points_path for sweep in named])
-    return named
+    """The sweeps; where several have one name, as in different folders, these stand before it."""
+    paths = [sweep.points_path for sweep in sweeps]
+    names = distinct_names([(path.parent, sweep.name) for path, sweep in zip(paths, sweeps, strict=True)])
+    _check_distinct(names, paths)
+    return tuple(dataclasses.replace(sweep, name=name) for sweep, name in zip(sweeps, names, strict=True))
+
+
+def distinct_names(places: Sequence[tuple[pathlib.PurePath, str]]) -> list[str]:
+    """The names; where several are the same, as many folders before them as tell them apart.
+
+    Args:
+      places: folder and name of each.
+
+    Returns:
+      The names, in this order. They differ unless both folder and name are the same.
+
+    >>> distinct_names([(pathlib.PurePath(folder), "1") for folder in ("a/velodyne", "b/velodyne")])
+    ['a_velodyne_1', 'b_velodyne_1']
+    """
+    names, depth = [name for _, name in places], 0
+    while len(set(names)) < len(names) and depth < max(len(path.parts) for path, _ in places):
+        depth += 1
+        counts = collections.Counter(names)
+        names = [
+            "_".join([*path.parts[-depth:], given]).replace("/", "") if counts[name] > 1 else name
+            for name, (path, given) in zip(names, places, strict=True)
+        ]
+    return names
 
 
 def _check_distinct(names: Sequence[str], paths: Sequence[pathlib.Path]) -> None:
     first: dict[str, pathlib.Path] = {}
     for name, path in zip(names, paths, strict=True):
+        if path == first.get(name):
+            raise InputError(f"{path}: given twice, by itself or by a folder that holds it; name it once.")
         if name in first:
             raise InputError(
                 f"{path}: its sweep would be named {name}, as that of {first[name]}, and share its results. "

@@ -10,6 +10,7 @@ from jaxbox.config import DetectorConfig, VehicleConfig
 from jaxbox.reference.completion import is_large
 from jaxbox.reference.fronts import find_fronts
 from jaxbox.reference.ground import ground_elevation
+from jaxbox.reference.hull import sampled_points
 from jaxbox.reference.rectangles import wrap_yaw
 from jaxbox.reference.state import (
     NO_CLUSTER,
@@ -205,7 +206,10 @@ def _count_points(found: Found, config: DetectorConfig) -> dict[str, Any]:
     sweep, obstacles, box, maps = found.sweep, found.obstacles, config.box, found.maps
     height = obstacles.height
     clustered = int(np.any([of_map.of_point != NO_CLUSTER for of_map in maps], axis=0).sum())
-    slab = (height > box.slab_min_height_m) & (height < box.slab_max_height_m)
+    slab = [
+        sum(len(sampled_points(cluster.members, obstacles.xyz, height, box)) for cluster in of_map.clusters)
+        for of_map in maps
+    ]
     return {
         "dropped_points": 0,
         "nonfinite_points": int((~sweep.finite).sum()),
@@ -215,7 +219,7 @@ def _count_points(found: Found, config: DetectorConfig) -> dict[str, Any]:
         "dropped_obstacles": obstacles.count - len(obstacles.row),
         "clustered_points": clustered,
         "unclustered_points": len(height) - clustered,
-        "slab_points": int(slab.sum()),
+        "slab_points": max(slab),
         "cells": tuple(of_map.num_runs for of_map in maps),
         "clusters": tuple(of_map.num_found for of_map in maps),
         "large_clusters": sum(is_large(cluster, config.vehicles) for cluster in found.clusters),

@@ -45,15 +45,20 @@ def fit_points(members: np.ndarray, xyz: np.ndarray, height: np.ndarray, config:
     Returns:
       (k,) int, k <= max_points.
     """
+    chosen = sampled_points(members, xyz, height, config)
+    if len(chosen) <= config.max_points:
+        return chosen
+    return chosen[np.arange(config.max_points) * len(chosen) // config.max_points]
+
+
+def sampled_points(members: np.ndarray, xyz: np.ndarray, height: np.ndarray, config: BoxConfig) -> np.ndarray:
+    """The members of the lowest ranks, as `fit_points` before it spreads what are still too many."""
     slab = members[
         (height[members] > config.slab_min_height_m) & (height[members] < config.slab_max_height_m)
     ]
     least = max(float(config.min_slab_points), np.float32(config.min_slab_share) * np.float32(len(members)))
     chosen = slab if len(slab) >= least else members
-    chosen = chosen[sampling_rank(xyz[chosen]) < sampled_share(len(chosen), config.max_points)]
-    if len(chosen) <= config.max_points:
-        return chosen
-    return chosen[np.arange(config.max_points) * len(chosen) // config.max_points]
+    return chosen[sampling_rank(xyz[chosen]) < sampled_share(len(chosen), config.max_points)]
 
 
 def convex_hulls(clusters: Sequence[np.ndarray]) -> list[np.ndarray]:
