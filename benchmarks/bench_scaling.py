@@ -1,6 +1,6 @@
 """How the time of a sweep goes with its points, with the batch, and with devices and processes.
 
-    python -m benchmarks.bench_scaling [--preset paper] [--quick] [--json FILE]
+    python -m benchmarks.bench_scaling [--preset paper] [--quick] [--parts batches ...] [--json FILE]
 
 Sweeps of 16,384 to 1,048,576 points are real ones: thinned out, or several turned about the sensor and laid
 over each other, which no scene is, so some capacities overflow (status). A batch is a loop over `detect`, a
@@ -37,6 +37,17 @@ QUICK_CAPACITIES = (2**14, 2**17)
 RUNS, QUICK_RUNS = 20, 5
 STREAMED, QUICK_STREAMED = 160, 24
 """Sweeps of a measurement of throughput."""
+PARTS: dict[str, dict[str, str]] = {
+    "sizes": {
+        "points": "points", "median": "median ms", "p90": "p90 ms", "ns_per_point": "ns a point",
+        "first_call_s": "first call s", "status": "status",
+    },
+    "batches": {n: n for n in ("batch", "loop", "detect_batch", "vmap", "vmap_same_bits", "vmap_scratch_mb")},
+    "throughput": {
+        "call": "", "on": "on", "sweeps_per_s": "sweeps a second", "times_the_first": "times the first"
+    },
+}  # fmt: skip
+"""Parts that can be measured, with the columns of their tables."""
 ROUNDS = 5
 """Measurements of throughput of each kind."""
 TURN_DEG = 17.3
@@ -234,33 +245,35 @@ def _call(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Prints the tables and writes the report."""
     parser = common.parser(__doc__ or "", quick="few sizes, batches and sweeps")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     options: argparse.Namespace = parser.parse_args(arguments)
     if options.set:
         raise SystemExit("--set: scaling is measured with a preset as it is.")
-    config, quick = common.chosen_config(options), options.quick
+    config, quick, report = common.chosen_config(options), options.quick, {}
     sweeps = common.kitti_sweeps(8)
     points = [sweep.read_points()[0] for sweep in sweeps]
-    count, rounds = (QUICK_STREAMED, 1) if quick else (STREAMED, ROUNDS)
-    # Before this process has an accelerator's memory, which it would not share.
-    rates = throughput(sweeps, options.preset, count, rounds)
-    sizes = time_sizes(
-        points, QUICK_CAPACITIES if quick else CAPACITY_BUCKETS, config, QUICK_RUNS if quick else RUNS
-    )
-    clouds = [jax.device_put(PointCloud.from_numpy(xyz)) for xyz in points]
-    batches = time_batches(clouds, config, quick=quick)
+    # Throughput before this process has an accelerator's memory, which it would not share.
+    if "throughput" in options.parts:
+        count, rounds = (QUICK_STREAMED, 1) if quick else (STREAMED, ROUNDS)
+        report["throughput"] = throughput(sweeps, options.preset, count, rounds)
+    if "sizes" in options.parts:
+        capacities = QUICK_CAPACITIES if quick else CAPACITY_BUCKETS
+        report["sizes"] = time_sizes(points, capacities, config, QUICK_RUNS if quick else RUNS)
+    if "batches" in options.parts:
+        clouds = [jax.device_put(PointCloud.from_numpy(xyz)) for xyz in points]
+        report["batches"] = time_batches(clouds, config, quick=quick)
+    print_tables(report)
+    common.write_report(report, options)
 
-    columns = ("points", "median", "p90", "ns_per_point", "first_call_s")
-    header = ["points", "median ms", "p90 ms", "ns a point", "first call s", "status"]
-    common.print_table(header, [[*(r[c] for c in columns), ", ".join(r["status"])] for r in sizes])
-    print("\nms a sweep, 131,072 points")
-    names = ("loop", "detect_batch", "vmap", "vmap_same_bits", "vmap_scratch_mb")
-    common.print_table(["batch", *names], [[r["batch"], *(r.get(n) for n in names)] for r in batches])
-    print()
-    columns = ("call", "on", "sweeps_per_s", "times_the_first")
-    common.print_table(
-        ["", "on", "sweeps a second", "times the first"], [[row[c] for c in columns] for row in rates]
-    )
-    common.write_report({"sizes": sizes, "batches": batches, "throughput": rates}, options)
+
+def print_tables(report: dict[str, Any]) -> None:
+    """Prints a table of each part that was measured."""
+    for part, columns in PARTS.items():
+        if part in report:
+            print(f"\n{part}" + (", ms a sweep of 131,072 points" if part == "batches" else ""))
+            found = [[row.get(c) for c in columns] for row in report[part]]
+            rows = [[", ".join(v) if isinstance(v, list) else v for v in row] for row in found]
+            common.print_table(list(columns.values()), rows)
 
 
 if __name__ == "__main__":
