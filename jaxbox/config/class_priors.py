@@ -225,5 +225,5 @@ class Label(enum.IntEnum):
         recess_m=-1.0,
         past_ends_m=2.0,
         open_below=1.0,
-        min_open=0.06,
+        min_open=0.05,
     )
