@@ -112,6 +112,9 @@ ABLATIONS = (
     Ablation("tops are as high as seen, cut off, bumpers or not", {"vehicles.unseen_top_score": 0.0}),
     Ablation("trucks: nothing past the ends counts", {"vehicles.classes.2.past_ends_m": 0.0}),
     Ablation("trucks: free space below the body counts", {"vehicles.classes.2.open_below": 0.0}),
+    Ablation("trucks: cut off or seen from one side, no beam need pass below", {
+        "vehicles.classes.2.min_open": 0.0,
+    }),
     Ablation("trucks: 2.4 m high where they are cut off, too", {"vehicles.classes.2.min_cut_height_m": 2.4}),
     Ablation("upright things not told from cars", {"vehicles.upright_score": 1.0}),
     Ablation("vans from 2.0 m on", {"vehicles.classes.1.min_height_m": 2.0}),

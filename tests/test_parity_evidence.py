@@ -179,7 +179,7 @@ def test_rays_over_boxes_end_as_in_the_reference(cases):
         expected = reference.cast_rays(case.evidence, boxes.astype(float), num_rays=NUM_RAYS)
         rays = parity.on_host(cast_rays(case.evidence_as_input(), parity.pad(boxes, 1024)))
         differ = np.zeros(len(boxes), bool)
-        for kind in ("hit", "free", "deep", "occluded", "free_length"):
+        for kind in ("hit", "free", "deep", "occluded", "free_length", "open"):
             gap = np.abs(getattr(rays, kind)[: len(boxes)] - getattr(expected, kind))
             differ |= gap > 1e-6
             parity.assert_share(

@@ -84,7 +84,9 @@ def test_only_ends_as_wide_as_a_vehicle_beside_no_sensor_are_looked_at():
 
 
 def test_in_a_row_only_rays_that_reach_a_vehicle_count():
-    rays = RayFractions(*np.array([[0.3, 0.2, 0.0], [0, 0.2, 0], [0, 0, 0], [0.7, 0.6, 1.0], [0, 0, 0]]))
+    rays = RayFractions(
+        *np.array([[0.3, 0.2, 0.0], [0, 0.2, 0], [0, 0, 0], [0.7, 0.6, 1.0], [0, 0, 0], [0, 0, 0]])
+    )
     np.testing.assert_allclose(_rows.hit_share(rays, np.zeros(3, bool)), rays.hit)
     shares = _rows.hit_share(rays, np.ones(3, bool))
     np.testing.assert_allclose(shares, [1, 0.5, 0], atol=1e-6)

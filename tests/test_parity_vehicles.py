@@ -104,7 +104,7 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
 def score_boxes(columns, prior):
     around = NeighbourhoodCounts(jnp.stack(columns["around"], axis=1))
     seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "objective"))
-    where = (columns[name] for name in ("rho", "reach", "seen_width"))
+    where = (columns[name] for name in ("rho", "reach", "seen_width", "is_open"))
     early = scoring.evidence_score(*seen, SETTINGS)
     late, top_unseen = scoring.neighbourhood_score(around, *where, prior, SETTINGS)
     by_size = scoring.size_score(columns["length"], columns["width"], prior)
@@ -132,6 +132,7 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
         "rho": rng.uniform(2, 80, MAX_BOXES),
         "reach": rng.uniform(0.5, 4, MAX_BOXES),
         "seen_width": rng.uniform(0, 2.5, MAX_BOXES),
+        "is_open": np.maximum(rng.uniform(-0.1, 0.2, MAX_BOXES), 0),
         "around": [
             rng.integers(1, 400, MAX_BOXES),
             np.where(rng.random(MAX_BOXES) < 0.5, prior.height_m, 1.5) + rng.normal(0, 0.5, MAX_BOXES),
@@ -159,9 +160,10 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
                 **one,
                 config=SETTINGS,
                 reach=float(columns["reach"][row]),
+                is_open=float(columns["is_open"][row]),
             )
         )
-        where = (float(columns[name][row]) for name in ("rho", "reach", "seen_width"))
+        where = (float(columns[name][row]) for name in ("rho", "reach", "seen_width", "is_open"))
         late = reference.neighbourhood_score(around, *where, SETTINGS.classes[label[row]], SETTINGS)
         expected_unseen.append(late[1])
     expected = np.array(expected)
@@ -176,7 +178,7 @@ def test_free_space_below_a_body_counts_as_in_the_reference():
     rng = np.random.default_rng(0)
     free, free_length = rng.random((2, MAX_BOXES)).astype(np.float32)
     nothing = np.zeros(MAX_BOXES, np.float32)
-    rays = RayFractions(1 - free, free, nothing, nothing, free_length)
+    rays = RayFractions(1 - free, free, nothing, nothing, free_length, free)
     for open_below in (0.0, 0.4, 1.0, 1.2):
         prior = dataclasses.replace(SETTINGS.classes[0], open_below=open_below)
         ours = _priors.closed_free_length(rays, prior)

@@ -48,7 +48,8 @@ def moved(box, *, x=0.0, length=0.0, width=0.0):
 
 
 def lidar_sweep(boxes, *, noise_m=0.01, seed=0):
-    """A 64-beam sweep of flat ground and upright boxes (x, y, length, width, yaw, height)."""
+    """A 64-beam sweep of flat ground and upright boxes (x, y, length, width, yaw, height), from the
+    ground or from a seventh number on."""
     rng = np.random.default_rng(seed)
     azimuth, elevation = np.meshgrid(
         np.radians(np.arange(-60, 60, 0.2)), np.radians(np.linspace(-24.9, 2, 64))
@@ -58,10 +59,10 @@ def lidar_sweep(boxes, *, noise_m=0.01, seed=0):
     )
     ray = ray.reshape(3, -1).T
     distance = np.where(ray[:, 2] < 0, SENSOR_HEIGHT_M / np.maximum(-ray[:, 2], 1e-9), np.inf)
-    for x, y, length, width, yaw, height in boxes:
+    for x, y, length, width, yaw, height, *above in boxes:
         start = np.append(turned(np.array([-x, -y]), -yaw), 0.0)
         local = np.column_stack([turned(ray[:, :2], -yaw), ray[:, 2]])
-        low = np.array([-length / 2, -width / 2, -SENSOR_HEIGHT_M])
+        low = np.array([-length / 2, -width / 2, sum(above) - SENSOR_HEIGHT_M])
         high = np.array([length / 2, width / 2, height - SENSOR_HEIGHT_M])
         sides = np.stack([(low - start) / local, (high - start) / local])
         entry, leave = sides.min(axis=0).max(axis=1), sides.max(axis=0).min(axis=1)
@@ -507,6 +508,7 @@ def test_boxes_at_before_and_behind_a_wall_and_in_the_open_are_hit_free_hidden_a
     boxes = np.array([[11.0, 0, 2, 3, 0], [12.0, 12, 3, 2, 0.3], [25.0, 0, 3.9, 1.6, 0.2]])
     rays = reference.cast_rays(wall_evidence(), boxes, num_rays=48)
     np.testing.assert_allclose(rays.hit, [1, 0, 0])
+    np.testing.assert_allclose(rays.open, rays.free)
     # Rays over the corners of a box are too short to cover a whole range cell.
     assert rays.free[1] > 0.7
     np.testing.assert_allclose(rays.free + rays.occluded, [0, 1, 1])
@@ -530,11 +532,30 @@ def test_ray_shares_sum_to_one_and_a_mirrored_sweep_gives_mirrored_shares():
             xyz * [1, sign, 1], height, SENSOR_HEIGHT_M, even_ground, EVIDENCE
         )
         rays = reference.cast_rays(evidence, boxes * [1, sign, 1, 1, sign], num_rays=33)
-        shares.append([rays.hit, rays.free, rays.occluded, rays.deep, rays.free_length])
+        shares.append([rays.hit, rays.free, rays.occluded, rays.deep, rays.free_length, rays.open])
+        assert (rays.free <= rays.open).all()
     np.testing.assert_allclose(np.sum(shares[0][:4], axis=0), 1)
     # The middle ray of a box may fall on the border of two azimuth cells: one ray of 33.
     np.testing.assert_allclose(shares[0], shares[1], atol=1.01 / 33)
     assert np.std(shares[0], axis=1).min() > 0.01
+
+
+def test_beams_below_a_body_leave_its_rays_hit_and_open_and_a_wall_leaves_them_closed():
+    azimuth = np.linspace(-0.1, 0.1, 200)
+    face, behind = (
+        np.column_stack([rho * np.cos(azimuth), rho * np.sin(azimuth), np.full(200, height)])
+        for rho, height in ((10.0, 1.0), (14.0, 0.0))
+    )
+    box = np.array([[11.3, 0.0, 2.6, 1.6, 0.0]])
+    # Rays through the sides leave the box before a whole cell of it is free.
+    for xyz, least, most in ((face, 0.0, 0.0), (np.concatenate([face, behind]), 0.8, 1.0)):
+        height = xyz[:, 2]
+        evidence = reference.build_evidence(
+            xyz - [0, 0, SENSOR_HEIGHT_M], height, SENSOR_HEIGHT_M, even_ground, EVIDENCE
+        )
+        rays = reference.cast_rays(evidence, box, num_rays=16)
+        assert (rays.hit[0], rays.free[0]) == (1, 0)
+        assert least <= rays.open[0] <= most
 
 
 def test_the_share_of_hit_rays_is_the_share_of_the_span_that_holds_returns():
@@ -945,6 +966,29 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     assert score(moved(PERFECT_BOX, x=30), around=bumper, prior=as_vans) == 0
 
 
+def test_what_may_be_a_wall_is_a_truck_as_far_as_beams_pass_below():
+    truck = dataclasses.replace(SCORE.classes[2], prior_weight=1.0, min_open=0.06)
+    box = np.array([10.0, 5.0, truck.length_m, truck.width_m, 0.0])
+
+    def score(is_open, *, top=truck.height_m, measured_m=truck.width_m, reach=9.0, prior=truck):
+        around = dataclasses.replace(PERFECT["around"], top=top)
+        measured = truck.length_m, measured_m
+        return score_of(box, prior, around=around, measured=measured, reach=reach, is_open=is_open)
+
+    shares = 0, 0.03, 0.06, 0.2
+    # Seen to its top, and from two sides: nothing is asked.
+    assert [score(share) for share in shares] == [1, 1, 1, 1]
+    one_side = [score(share, measured_m=0.0) for share in shares]
+    np.testing.assert_allclose(one_side, [0, 0.5, 1, 1])
+    assert score(0, measured_m=0.2 * truck.width_m) == pytest.approx(0.5)
+    cut_off = [score(share, top=2.2, reach=2.2) for share in shares]
+    np.testing.assert_allclose(cut_off, [0, 0.35, 0.7, 0.7])
+    # A top that suits the class tells nothing either where the highest beam passes there.
+    np.testing.assert_allclose([score(share, reach=truck.height_m) for share in shares], [0, 0.5, 1, 1])
+    indifferent = dataclasses.replace(truck, min_open=0.0)
+    assert score(0, measured_m=0.0, prior=indifferent) == 1
+
+
 @pytest.mark.parametrize(
     "fault",
     [
@@ -1013,7 +1057,8 @@ def test_cars_on_flat_ground_are_found_where_they_stand(car_scene):
 
 
 def test_a_truck_is_called_a_truck_and_a_car_is_not():
-    truck = (28.0, 6.0, 10.8, 2.6, -0.3, 3.3)
+    # Beams pass below a truck's body: one that stood on the ground would be a wall.
+    truck = (28.0, 6.0, 10.8, 2.6, -0.3, 3.3, 0.6)
     # All points: the far end of so long a side has few of them, and a sample may end before it.
     config = DetectorConfig(box=BoxConfig(max_points=2000))
     detections = reference.detect(lidar_sweep([truck, CARS[1]]), config)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from benchmarks import bench_situations, common
-from jaxbox import DetectorConfig, PointCloud, Status, detect
+from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig, Label, PointCloud, Status, detect
 from jaxbox.evaluation.iou import pairwise_overlaps
-from jaxbox.synthetic import TruthBoxes
+from jaxbox.synthetic import TruthBoxes, make_sweep
 from jaxbox.synthetic.scene import outline
 from jaxbox.synthetic.situations import SITUATIONS
 from jaxbox.synthetic.solids import Solid
@@ -103,6 +103,15 @@ def find():
 @pytest.mark.parametrize("title", IN_SHORT)
 def test_what_is_said_to_be_found_is_found(title, find):
     assert bench_situations.measure(BY_TITLE[title], find)["found"] >= IN_SHORT[title]
+
+
+@pytest.mark.parametrize("seed", [0, 3])
+def test_facades_that_end_where_a_truck_would_are_none(seed, find):
+    street = make_sweep(seed, num_vehicles=12)
+    boxes = find(street.xyz).on_host().above(DEFAULT_SCORE_THRESHOLD)
+    trucks = np.asarray(boxes.center)[np.asarray(boxes.label) == Label.TRUCK, :2]
+    vehicles = street.boxes.center[:, :2]
+    assert (np.linalg.norm(trucks[:, None] - vehicles, axis=2).min(axis=1) < 4).all()
 
 
 @pytest.mark.parametrize("name", ["situations", "situations_before"])

@@ -67,6 +67,10 @@ class ClassPrior:
     open_below: Scalar
     """Share of the free space behind hits that is no evidence against such a vehicle: 1 or more where beams
     pass below the body, 0 where they do not."""
+    min_open: Scalar
+    """Share of the rays over a box that see free space in it, below the body say, where nothing else tells
+    such a vehicle from a wall: its top lies above the highest beam, or little of its width was measured. The
+    fewer do, the less it scores; 0 asks for nothing."""
 
 
 _FRONT_PROFILES = {
@@ -175,6 +179,7 @@ class Label(enum.IntEnum):
         recess_m=0.3,
         past_ends_m=0.0,
         open_below=0.0,
+        min_open=0.0,
     )
     VAN = ClassPrior(
         length_m=4.98,
@@ -197,6 +202,7 @@ class Label(enum.IntEnum):
         recess_m=0.15,
         past_ends_m=0.0,
         open_below=0.0,
+        min_open=0.0,
     )
     TRUCK = ClassPrior(
         length_m=8.5,
@@ -219,4 +225,5 @@ class Label(enum.IntEnum):
         recess_m=-1.0,
         past_ends_m=2.0,
         open_below=1.0,
+        min_open=0.05,
     )

@@ -281,6 +281,7 @@ def cast_rays(evidence: Evidence, boxes: np.ndarray, *, num_rays: int) -> RayFra
         occluded=(counted & ~hit & ~through & ~deep).sum(axis=1) / total,
         deep=deep.sum(axis=1) / total,
         free_length=free.sum(axis=1) / np.maximum(length.sum(axis=1), 1),
+        open=(free > 0).sum(axis=1) / total,
     )
 
 

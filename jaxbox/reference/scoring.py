@@ -31,6 +31,8 @@ CUT_SLACK_M = 0.1
 BUMPER_RAMP_M, BUMPER_WIDTHS = 10.0, (0.6, 0.8)
 """A far box may be a bumper alone: the more the farther over so much range, and the wider between these
 shares of the class's width."""
+WIDE = 0.4
+"""A box of less than this share of the class's width is seen from one side: it may be a wall."""
 MAX_END_MARGIN_M = 0.4
 """An end lies no farther beyond the last point than this."""
 
@@ -62,10 +64,11 @@ def score_boxes(
 
     def judge(row: int, hypothesis: ClassHypothesis, box: CompletedBox) -> Candidate:
         cluster, prior = clusters[hypothesis.cluster], config.vehicles.classes[hypothesis.label]
-        hit, free_length, support = 1.0, 0.0, None
+        hit, free_length, is_open, support = 1.0, 0.0, 1.0, None
         if rays is not None:
             free = closed_free_length(rays[0], prior)
-            hit, free_length, support = (float(a[row]) for a in (hit_share(rays[0], in_row), free, rays[1]))
+            seen = hit_share(rays[0], in_row), free, rays[0].open, rays[1]
+            hit, free_length, is_open, support = (float(a[row]) for a in seen)
         early = early_score(
             box,
             prior,
@@ -82,7 +85,7 @@ def score_boxes(
             early *= seen + float(config.vehicles.hidden_length_score) * (1 - seen)
         rho = float(np.hypot(box.box[0], box.box[1]))
         lowest_z = obstacles.xyz[cluster.members, 2].min() if config.ground.max_planes > 1 else 0.0
-        where = rho, reach(box.box, lowest_z), box.measured_width_m
+        where = rho, reach(box.box, lowest_z), box.measured_width_m, is_open
         late, top_unseen = neighbourhood_score(around, *where, prior, config.vehicles)
         return Candidate(hypothesis, box, around, top_unseen, early * late)
 
@@ -195,6 +198,7 @@ def score_box(
     support: float | None,
     config: VehicleConfig,
     reach: float = np.inf,
+    is_open: float = 1.0,
 ) -> float:
     """How much a box looks like a vehicle of a class: a product of factors in [0, 1].
 
@@ -208,6 +212,7 @@ def score_box(
       support: ground points round the box, or None where they were not counted.
       config: of the score.
       reach: m above the ground, height of the highest beam where the box begins.
+      is_open: share of the rays that see free space in the box.
 
     Returns:
       The score, without what a hidden length costs; 0 where a gate of the class closes.
@@ -222,7 +227,8 @@ def score_box(
         config=config,
     )
     rho = float(np.hypot(box.box[0], box.box[1]))
-    return early * neighbourhood_score(around, rho, reach, box.measured_width_m, prior, config)[0]
+    where = rho, reach, box.measured_width_m, is_open
+    return early * neighbourhood_score(around, *where, prior, config)[0]
 
 
 def early_score(
@@ -297,6 +303,7 @@ def neighbourhood_score(
     rho: float,
     reach: float,
     seen_width_m: float,
+    is_open: float,
     prior: ClassPrior,
     config: VehicleConfig,
 ) -> tuple[float, bool]:
@@ -310,6 +317,8 @@ def neighbourhood_score(
         may that of a vehicle of which only a bumper returns, beyond `bumper_from_m`.
       seen_width_m: m, measured: the first falls with the width below half the class's, a bumper is as wide as
         the class.
+      is_open: share of the rays that see free space in the box: where it is less than `min_open`, what is cut
+        off, or was measured to less than `WIDE` of the class's width, is rather a wall.
       prior: of the class.
       config: exp(-(ring weight x ring + overhead weight x above) / inside), and a factor from
         `upright_score`, where no upper point is recessed, to 1 from the share `recess_share` on. Points above
@@ -321,11 +330,15 @@ def neighbourhood_score(
     """
     highest = around.top + config.top_grade * rho
     widths = prior.height_m, prior.height_below_m, prior.height_above_m
+    no_wall = min(is_open / float(prior.min_open), 1.0) if prior.min_open > 0 else 1.0
+    seen_width = seen_width_m / float(prior.width_m)
+    cut = np.interp(around.top - reach, [-CUT_SLACK_M, 0], [0, 1])
     seen = unseen = 0.0
     if prior.min_height_m < highest and around.top < prior.max_height_m:
         seen = asymmetric_gaussian(min(max(prior.height_m, around.top), highest), *widths)
+        seen *= max(no_wall, (1 - cut) * min(seen_width / WIDE, 1.0))
     if around.top < prior.max_height_m:
-        unseen = _share_unseen(around.top, rho, reach, seen_width_m, prior, config)
+        unseen = _share_unseen(around.top, rho, cut * no_wall, seen_width, prior, config)
         unseen *= asymmetric_gaussian(max(prior.height_m, around.top), *widths)
     score = max(seen, unseen)
     gap = prior.count_max_height_m - highest
@@ -339,13 +352,12 @@ def neighbourhood_score(
 
 
 def _share_unseen(
-    top: float, rho: float, reach: float, seen_width_m: float, prior: ClassPrior, config: VehicleConfig
+    top: float, rho: float, is_cut: float, share: float, prior: ClassPrior, config: VehicleConfig
 ) -> float:
     """What the class's height counts where the top is out of sight: above the highest beam or a bumper."""
-    share = seen_width_m / float(prior.width_m)
     cut = bumper = 0.0
     if top > prior.min_cut_height_m:
-        cut = np.interp(top - reach, [-CUT_SLACK_M, 0], [0, 1]) * min(2 * share, 1.0)
+        cut = is_cut * min(2 * share, 1.0)
     if top > prior.min_bumper_m:
         bumper = np.interp(rho - float(config.bumper_from_m), [0, BUMPER_RAMP_M], [0, 1])
         bumper *= np.interp(share, BUMPER_WIDTHS, [0, 1])

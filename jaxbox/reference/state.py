@@ -144,6 +144,8 @@ class RayFractions:
     """(B,): tell nothing."""
     free_length: np.ndarray
     """(B,): length seen to be free over length within the box, all rays together."""
+    open: np.ndarray
+    """(B,): see free space within, whether they hit before or not."""
 
 
 @dataclasses.dataclass(frozen=True)

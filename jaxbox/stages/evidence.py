@@ -267,7 +267,7 @@ def cast_rays(evidence: Evidence, boxes: FlatBoxes, config: EvidenceConfig, *, n
     )
     # Counts of rays in float32, which are exact.
     sums = (jnp.sum(a, axis=axis, dtype=jnp.float32).reshape(shape) for a in met)
-    hit, free, deep, crosses, free_cells, cells = sums
+    hit, free, deep, is_open, crosses, free_cells, cells = sums
     total = jnp.maximum(crosses, 1)
     return RayFractions(
         hit=hit / total,
@@ -275,6 +275,7 @@ def cast_rays(evidence: Evidence, boxes: FlatBoxes, config: EvidenceConfig, *, n
         deep=deep / total,
         occluded=(crosses - hit - free - deep) / total,
         free_length=free_cells / jnp.maximum(cells, 1),
+        open=is_open / total,
     )
 
 
@@ -358,7 +359,7 @@ def _classify_rays(
     leave: jax.Array,
     range_cell_m: float,
 ) -> tuple[jax.Array, ...]:
-    """Whether each ray is a hit, free, deep, and crosses the box; its free cells and all its cells inside."""
+    """Whether each ray is a hit, free, deep, open, and crosses the box; its free and all its cells inside."""
     num_azimuths = evidence.free.shape[1]
     crosses = (leave > enter) & (enter >= MIN_ENTRY_M)
     # Where the ray misses, any valid range.
@@ -376,6 +377,7 @@ def _classify_rays(
     is_hit = crosses & (met_at < cell(jnp.minimum(enter + HIT_AFTER_M, leave + HIT_BEYOND_M), 1))
     cells = jnp.where(crosses, last - first, 0)
     free_cells = jnp.where(crosses, set_before(last_word, last) - set_before(first_word, first), 0)
-    is_free = ~is_hit & (free_cells > 0)
+    is_open = free_cells > 0
+    is_free = ~is_hit & is_open
     is_deep = crosses & ~is_hit & ~is_free & (met_at < cell(leave + DEEP_BEYOND_M, 1))
-    return is_hit, is_free, is_deep, crosses, free_cells, cells
+    return is_hit, is_free, is_deep, is_open, crosses, free_cells, cells

@@ -47,6 +47,10 @@ BUMPER_RAMP_M, BUMPER_WIDTHS = 10.0, (0.6, 0.8)
 fractions of the class's width it is believed to be one."""
 
 
+WIDE = 0.4
+"""From this fraction of the class's width on a box has two faces, as walls seldom have."""
+
+
 INSIDE_TOLERANCE_M = 1e-3
 """A point on the face of its box is inside."""
 
@@ -91,14 +95,15 @@ def score_boxes(
         size = jnp.stack([box.length, box.width, wrap_yaw(box.yaw)], axis=1)
         rectangle = jnp.concatenate([box.center, size], axis=1)
         of_hypothesis = take(hypotheses.label, chosen), take(hypotheses.cluster, chosen)
-        return rectangle, *of_hypothesis, take(score, chosen), box.measured, box.in_row
+        is_open = jnp.ones_like(box.yaw) if rays is None else take(rays[0].open, chosen)
+        return rectangle, *of_hypothesis, take(score, chosen), box.measured, box.in_row, is_open
 
     picked = map_rows(pick, chosen, num_rows=num)
     rectangle, label, cluster, early, *_ = picked
     around = _look_around(rectangle, label, cluster, early, num, clusters, obstacles, config)
 
     def finish(rows: tuple[Any, ...]) -> Candidates:
-        rectangle, label, cluster, score, measured, in_row, around = rows
+        rectangle, label, cluster, score, measured, in_row, is_open, around = rows
         if config.vehicles.neighbourhood and config.completion.mode != "none":
             ended, seen = _end_where_seen(rectangle, label, measured[:, 0], around, config)
             rectangle = jnp.where(in_row[:, None], rectangle, ended)
@@ -107,7 +112,7 @@ def score_boxes(
         ground = ground_elevation(jnp.concatenate([rectangle[:, :2], z[:, None]], axis=1))
         nearest = jnp.hypot(*_distances_outside(rectangle))
         reach = NOT_CUT_M * jnp.ones_like(ground) if steepest is None else steepest * nearest - ground
-        row = rectangle, label, cluster, score, measured[:, 1], around
+        row = rectangle, label, cluster, score, measured[:, 1], is_open, around
         candidates = _finish(row, reach, clusters, settings)
         return dataclasses.replace(candidates, bottom=candidates.bottom + ground)
 
@@ -191,10 +196,10 @@ def _end_where_seen(
 
 def _finish(rows: tuple[Any, ...], reach: jax.Array, clusters: Clusters, config: VehicleConfig) -> Candidates:
     """Candidates with their score and height, bottoms above the ground, in the order that they came in."""
-    rectangle, label, cluster, score, seen_width_m, around = rows
+    rectangle, label, cluster, score, seen_width_m, is_open, around = rows
     prior = prior_of(config.classes, label)
     rho = jnp.linalg.norm(rectangle[:, :2], axis=1)
-    late, top_unseen = neighbourhood_score(around, rho, reach, seen_width_m, prior, config)
+    late, top_unseen = neighbourhood_score(around, rho, reach, seen_width_m, is_open, prior, config)
     height = jnp.maximum(around.top + config.top_margin_m, prior.min_box_height_m)
     height = jnp.where(top_unseen, jnp.maximum(height, prior.height_m), height)
     bottom = jnp.zeros_like(height)
@@ -313,6 +318,7 @@ def neighbourhood_score(
     rho: jax.Array,
     reach: jax.Array,
     seen_width_m: jax.Array,
+    is_open: jax.Array,
     prior: ClassPrior,
     config: VehicleConfig,
 ) -> tuple[jax.Array, jax.Array]:
@@ -323,12 +329,16 @@ def neighbourhood_score(
     vehicles return from a bumper alone, it may lie anywhere above: then the height says nothing, and counts
     less.
 
+    Facades and walls end where a truck may end, but no beam passes below them: what is cut off, or has no
+    known width, counts as such a class as far as rays see free space in the box.
+
     Args:
       around: see `count_points_around`.
       rho: (P,) float32, m, range of the box.
       reach: (P,) float32, m above the ground: height of the highest beam where the box begins.
       seen_width_m: (P,) float32, m: what was measured of the width. Of one long face nothing is known but its
         length, which walls have too: only from half the usual width on may the top be out of sight.
+      is_open: (P,) float32, fraction of the rays that see free space inside.
       prior: fields of (P,) float32.
       config: exp(-(ring weight x ring + overhead weight x above) / inside), and what upright boxes lose:
         those with few upper points come near to the full score. Points above count as far as they are
@@ -343,8 +353,12 @@ def neighbourhood_score(
     connected = jnp.clip(2 - clearance / config.overhead_gap_m, 0, 1)
     overhead = config.overhead_weight * connected * around.num_above
     clutter = (config.ring_weight * around.num_ring + overhead) / jnp.maximum(around.num_inside, 1)
-    unseen = _unseen_top_score(around.top, rho, reach, seen_width_m / prior.width_m, prior, config)
+    seen_width, too_few = seen_width_m / prior.width_m, is_open < prior.min_open
+    cut = jnp.clip(1 + (around.top - reach) / CUT_SLACK_M, 0, 1)
+    no_wall = jnp.where(too_few, is_open / jnp.where(too_few, prior.min_open, 1), 1)
+    unseen = _unseen_top_score(around.top, rho, cut * no_wall, seen_width, prior, config)
     seen = _height_score(around.top, highest, prior)
+    seen = seen * jnp.maximum(no_wall, (1 - cut) * jnp.minimum(seen_width / WIDE, 1))
     score, top_unseen = jnp.maximum(seen, unseen), unseen > seen
     score = score * jnp.exp(-clutter)
     recessed = around.num_recessed + PSEUDO_COUNT * config.recess_share
@@ -365,13 +379,13 @@ def _height_score(top: jax.Array, highest: jax.Array, prior: ClassPrior) -> jax.
 def _unseen_top_score(
     top: jax.Array,
     rho: jax.Array,
-    reach: jax.Array,
+    cut: jax.Array,
     seen_width: jax.Array,
     prior: ClassPrior,
     config: VehicleConfig,
 ) -> jax.Array:
     """(P,) the same where the top is out of sight; `seen_width` is a fraction of the class's."""
-    cut = jnp.clip(1 + (top - reach) / CUT_SLACK_M, 0, 1) * jnp.clip(2 * seen_width, 0, 1)
+    cut = cut * jnp.clip(2 * seen_width, 0, 1)
     cut = jnp.where(top > prior.min_cut_height_m, cut, 0)
     narrow, wide = BUMPER_WIDTHS
     bumper = jnp.clip((rho - config.bumper_from_m) / BUMPER_RAMP_M, 0, 1)

@@ -213,6 +213,8 @@ class RayFractions:
     """(...) float32: nothing is known."""
     free_length: jax.Array
     """(...) float32: length of free space inside the box over the length of all rays inside."""
+    open: jax.Array
+    """(...) float32: free space inside, behind a hit (below a body, say) or not."""
 
 
 class FlatBoxes(Protocol):
