@@ -135,8 +135,8 @@ WHOLES = ("host to host", "on the device")
 
 def gpu() -> str:
     """Whole sweeps on a GPU, one by one and in batches."""
-    one_by_one = {"default": load("stages_h100"), "paper": load("stages_paper_h100")}
-    scaling = load("scaling_h100")
+    one_by_one = {"default": load("stages_h200"), "paper": load("stages_paper_h200")}
+    scaling = load("scaling_h200")
     rows = [
         (f"{preset}, {name}", r["whole"][name]["median"])
         for preset, r in one_by_one.items()
