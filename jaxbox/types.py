@@ -24,11 +24,11 @@ import numpy as np
 from jaxbox._box import ByValue, Detection
 from jaxbox._box_rows import BoxRows, later_module
 from jaxbox._padding import aligned_empty, checked_points, fill_rows, fitting_capacity
-from jaxbox._transfer import to_host
 from jaxbox.config import DetectorConfig
 from jaxbox.config import Label as Label  # noqa: PLC0414 - one of the types that users hold
 from jaxbox.config.capacities import CAPACITIES, CLOUD_CAPACITY, Capacity
 from jaxbox.config.class_priors import classes_in_words
+from jaxbox.xla.transfer import to_host
 
 GROUND_ABOVE_M = 0.5
 """A ground plane that passes this high over the origin lies above the sensor: where recordings are in their

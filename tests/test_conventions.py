@@ -20,7 +20,7 @@ PROJECT = ROOT.parent
 # Each layer may import those before it, and itself.
 LAYERS = [
     # The standard library and NumPy alone.
-    {"_version", "_extras", "_files", "_interrupts", "_loopback", "_padding", "_transfer"},
+    {"_version", "_extras", "_files", "_interrupts", "_loopback", "_padding"},
     {"config"},
     # `_box` and `_box_rows` are parts of `types`: what one box, and what boxes of any kind, can do.
     {"_box", "_box_rows", "types", "geometry", "xla"},

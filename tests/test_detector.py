@@ -239,11 +239,13 @@ def test_a_batch_on_an_accelerator_finds_what_the_singles_do_on_a_cpu_in_their_s
     assert_shapes_of_singles(many, len(sweeps))
     for row, xyz in enumerate(sweeps):
         single = run(xyz)
-        # Rounded otherwise, so that a point on a border may fall to the other side of it, and a piece of a
-        # wall that scores next to nothing may be as close to the next rotation.
-        some = single.score > 1e-3
-        for name in ("center", "size", "yaw"):
-            np.testing.assert_allclose(getattr(many, name)[row][some], getattr(single, name)[some], atol=1e-4)
+        # Rounded otherwise, so that a point on a border may fall to the other side of it, and one piece of a
+        # wall, which scores next to nothing, is as close to the next rotation.
+        of_row = jax.tree.map(lambda a, row=row: a[row], many)
+        boxes = [np.column_stack([f.center, f.size, f.yaw]) for f in (of_row, single)]
+        differ = (np.abs(boxes[0] - boxes[1]) > 1e-4).any(axis=1)
+        assert differ.sum() <= 1
+        assert (single.score[differ] < 1e-3).all()
         np.testing.assert_allclose(many.score[row], single.score, atol=1e-4)
         for name in ("label", "valid", "status"):
             np.testing.assert_array_equal(getattr(many, name)[row], getattr(single, name))

@@ -6,14 +6,12 @@ import re
 import sys
 import types
 
-import chex
 import jax
 import numpy as np
 import pytest
 
 import jaxbox
 from jaxbox import Detections, Label, PointCloud, io, synthetic, viz
-from jaxbox._transfer import transfer_together
 from jaxbox.cli.box_filter import BoxFilter
 from jaxbox.config import RegionConfig
 from jaxbox.io.parquet import box_rows
@@ -57,15 +55,6 @@ def test_the_length_is_of_valid_rows_and_the_boxes_are_those_in_their_order(foun
         np.testing.assert_array_equal(box.center, host.center[row])
         np.testing.assert_array_equal(box.size, host.size[row])
     assert found[-1] == list(found)[-1]
-
-
-def test_one_transfer_brings_every_array_as_it_is(found, tracks):
-    empty = {"none": np.zeros((0, 3), np.float32), "flag": np.bool_(True), "words": np.uint32([7, 2**32 - 1])}
-    for tree in (found, tracks, jax.tree.map(jax.numpy.asarray, empty)):
-        brought = transfer_together(tree)
-        chex.assert_trees_all_equal(brought, jax.device_get(tree))
-        chex.assert_trees_all_equal_shapes_and_dtypes(brought, jax.device_get(tree))
-        assert all(leaf.flags.aligned for leaf in jax.tree.leaves(brought))
 
 
 def test_all_of_them_are_the_same_without_padding(found):

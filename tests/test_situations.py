@@ -109,6 +109,7 @@ def test_what_is_said_to_be_found_is_found(title, find):
 def test_facades_that_end_where_a_truck_would_are_none(seed, find):
     street = make_sweep(seed, num_vehicles=12)
     boxes = find(street.xyz).on_host().above(DEFAULT_SCORE_THRESHOLD)
+    assert len(boxes) > 5
     trucks = np.asarray(boxes.center)[np.asarray(boxes.label) == Label.TRUCK, :2]
     vehicles = street.boxes.center[:, :2]
     assert (np.linalg.norm(trucks[:, None] - vehicles, axis=2).min(axis=1) < 4).all()

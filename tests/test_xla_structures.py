@@ -59,8 +59,9 @@ def test_segments_have_the_maxima_and_sums_of_their_rows(num_maps, size):
 
 @pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize(("operation", "ufunc"), [("add", np.add), ("max", np.maximum)])
-@pytest.mark.parametrize("size", [1, 7, 300])
-def test_segments_are_folded_from_what_their_rows_look_up(operation, ufunc, size):
+@pytest.mark.parametrize(("size", "table_numbers"), [(1, 2**20), (7, 1), (300, 2**20)])
+def test_segments_are_folded_from_what_their_rows_look_up(operation, ufunc, size, table_numbers, monkeypatch):
+    monkeypatch.setattr(chunks, "TABLE_NUMBERS", table_numbers)
     rng = np.random.default_rng(size)
     # Whole numbers: their sums are exact in any order.
     table, num_segments = rng.integers(-9, 9, (20, 2)).astype(np.float32), 5
@@ -148,22 +149,31 @@ def test_the_points_of_a_cluster_are_listed_in_order_and_spread_over_all_it_has(
             np.testing.assert_array_equal(found, own[k][chosen])
 
 
-@pytest.mark.parametrize(("reduce", "combine", "initial"), [("sum", jnp.add, 0), ("max", jnp.maximum, -7)])
-def test_fold_points_takes_each_point_of_each_cluster_once(reduce, combine, initial, platform):
+@pytest.mark.parametrize(
+    ("operation", "combine", "ufunc", "initial"),
+    [("add", jnp.add, np.add, 0), ("max", jnp.maximum, np.maximum, -7)],
+    ids=["add", "max"],
+)
+def test_fold_points_takes_each_point_of_each_cluster_once(operation, combine, ufunc, initial, platform):
     x, y = np.random.default_rng(4).normal(size=(2, 6, 3)).astype(np.float32)
 
     def update(state, x, y):
-        return combine(state, jnp.where(x < 9, jnp.stack([x, y]), initial))
+        both, product = state
+        values = (
+            jnp.where(x < 9, jnp.stack([x, y]), initial),
+            jnp.where(x < 9, jnp.stack([y, x + y]), initial),
+        )
+        return combine(both, values[0]), combine(product, values[1])
 
-    options = {"absent": (9.0, jnp.zeros(3)), "operation": {"sum": "add", "max": "max"}[reduce]}
-    init = jnp.full((2, 3), initial, jnp.float32)
+    options = {"absent": (9.0, jnp.zeros(3)), "operation": operation}
+    init = (jnp.full((2, 3), initial, jnp.float32),) * 2
     fold = jax.jit(lambda counts: ragged.fold_points(x, y, counts, init, update, **options))
     for counts in ([0, 0, 0], [1, 0, 6], [6, 6, 6], [2, 9, 3]):
         found = fold(jnp.array(counts))
         for cluster, count in enumerate(np.minimum(counts, 6)):
-            points = np.stack([x, y])[:, :count, cluster]
-            expected = getattr(points, reduce)(axis=1, initial=initial)
-            np.testing.assert_allclose(found[:, cluster], expected, atol=1e-5)
+            for values, total in zip((np.stack([x, y]), np.stack([y, x + y])), found, strict=True):
+                expected = ufunc.reduce(values[:, :count, cluster], axis=1, initial=initial)
+                np.testing.assert_allclose(total[:, cluster], expected, atol=1e-5)
 
 
 # Runs of rows.

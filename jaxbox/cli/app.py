@@ -295,7 +295,7 @@ def tune(
     copies: Annotated[
         int, typer.Option(min=1, max=len(COPIES), help="Turned and mirrored copies of each sweep.")
     ] = 4,
-    objective: Annotated[str, typer.Option(help=f"One of {', '.join(OBJECTIVES)}; moderate R40.")] = "soft",
+    objective: Annotated[str, typer.Option(help=f"One of {', '.join(OBJECTIVES)}; R40.")] = "soft",
     drives: Annotated[
         pathlib.Path | None,
         typer.Option(

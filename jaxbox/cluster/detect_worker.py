@@ -88,7 +88,7 @@ class DetectWorker(PartitionWorker[DetectTask, PartitionReport]):
             clouds = [read.cloud for read in reads if read.cloud is not None]
             report.compile_s += sum(self._compile(cloud.capacity) for cloud in clouds)
             start = time.perf_counter()
-            # One sweep's arrays come to the host while the next are still computed.
+            # One sweep's arrays come to the host while a CPU still computes the next.
             found = iter(detect_batch(clouds, self._task.config))
             for read in reads:
                 detections = None if read.cloud is None else next(found).on_host()

@@ -194,7 +194,8 @@ def distinct_names(places: Sequence[tuple[pathlib.PurePath, str]]) -> list[str]:
       places: folder and name of each.
 
     Returns:
-      The names, in this order. They differ unless both folder and name are the same.
+      The names, in this order. They differ, unless places are the same, or their folders read alike once they
+      are joined, as ``a_b`` and ``a/b``.
 
     >>> distinct_names([(pathlib.PurePath(folder), "1") for folder in ("a/velodyne", "b/velodyne")])
     ['a_velodyne_1', 'b_velodyne_1']

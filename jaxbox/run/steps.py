@@ -14,7 +14,6 @@ from jax.typing import ArrayLike
 
 from jaxbox._box import ByValue
 from jaxbox._padding import fitting_capacity
-from jaxbox._transfer import to_host
 from jaxbox.config import DetectorConfig
 from jaxbox.config.capacities import CAPACITIES
 from jaxbox.config.checks import check_config
@@ -26,6 +25,7 @@ from jaxbox.types import GroundPlane, PointCloud
 from jaxbox.xla.backend import building_for, on_accelerator
 from jaxbox.xla.barriers import outline
 from jaxbox.xla.ragged import PointLists
+from jaxbox.xla.transfer import to_host
 
 _MIN_CLUSTERS = 64
 """Boxes are fitted to this many clusters, twice as many, and so on: one compile each."""

@@ -14,9 +14,9 @@ import numpy as np
 
 from jaxbox._box import Box
 from jaxbox._box_rows import BoxRows, later_module
-from jaxbox._transfer import to_host
 from jaxbox.config.class_priors import classes_in_words
 from jaxbox.types import Calibration, Motion
+from jaxbox.xla.transfer import to_host
 
 FREE = -1
 """`Tracks.id` of a slot without a vehicle, and `Tracks.detection` of a vehicle that was not detected."""

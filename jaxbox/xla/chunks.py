@@ -1,7 +1,8 @@
 """The one table of chunk sizes: how much is worked on at a time, on a CPU unless it says otherwise.
 
-None of them changes a result. A chunk is large enough for wide vectors and few iterations, and small enough
-for its scratch memory to stay in the cache; with one row at a time XLA compiles a loop to native code.
+None of them changes a result, but for the last bits of sums on an accelerator. A chunk is large enough for
+wide vectors and few iterations, and small enough for its scratch memory to stay in the cache; with one row at
+a time XLA compiles a loop to native code.
 ``python -m benchmarks.bench_chunks NAME`` times a size against its half and its double on real sweeps, in the
 step that it names; for sizes that it does not vary it names what chose them. What came of it is in
 docs/notes/kernels_on_cpu.md, and for accelerators in docs/notes/accelerators.md.
@@ -18,7 +19,8 @@ MINIMA_TABLES = 4
 processor waits for what it has just written."""
 
 MAX_TABLES, TABLE_NUMBERS = 32, 2**20
-"""Likewise on an accelerator, for whatever is reduced: at most so many tables, of so many numbers."""
+"""Likewise on an accelerator, whose atomic updates of one address are serialized: at most so many private
+tables, of so many numbers together."""
 
 PLANES = 32
 """RANSAC hypotheses tried at a time: few enough for their residuals to stay in the cache."""

@@ -49,9 +49,8 @@ def flag_cells(
         part = _chunk(whole, start)
         found = find(materialize(prepare(part)), part, start.astype(jnp.int32) + row < num_rows)
         if on_accelerator():
-            return _write(table, jnp.uint32(0), start, jnp.stack(found)), _flag(
-                flags, jnp.stack(found), cells
-            )
+            cell = jnp.stack(found)
+            return _write(table, jnp.uint32(0), start, cell), _flag(flags, cell, cells)
         for i, cell in enumerate(found):
             flags = flags.at[cells.flag(cell)].set(1, mode="promise_in_bounds")
             table = _write(table, jnp.uint32(i), start, cell)
@@ -64,7 +63,7 @@ def flag_cells(
 def _flag(flags: jax.Array, cell: jax.Array, cells: CellGrids) -> jax.Array:
     """Flags cells of all maps in one scatter, which reads and writes the flags once.
 
-    Rows that have no cell flag none: an accelerator writes to one place once at a time.
+    Rows that have no cell flag none: atomic updates of one address are serialized.
     """
     return flags.at[jnp.where(cell == NONE, cells.num_flags, cells.flag(cell))].set(1, mode="drop")
 

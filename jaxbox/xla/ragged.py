@@ -134,7 +134,7 @@ def fold_points(
       x: (M, C) float32.
       y: (M, C) float32.
       count: (C,) int32, points of each cluster.
-      init: pytree of (..., C) arrays, the state before the first point.
+      init: pytree of float32 arrays, all (..., C) of one shape: the state before the first point.
       update: maps the state and x (C,), y (C,) to the next state.
       absent: x and y, () or (C,) each, of the points that a cluster does not have, for a CPU: such that
         `update` makes nothing of them.

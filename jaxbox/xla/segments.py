@@ -88,20 +88,20 @@ def _reduce_parallel(
     row = jnp.where(valid, segment, table.shape[0])
     own = jnp.broadcast_to(_as_row(describe(rows)), (*row.shape, table.shape[1]))
     num_maxima = int(is_maximum.sum())
-    maxima = _scatter_in_turn("max", row, own[..., :num_maxima], num_segments=table.shape[0])
+    maxima = _scatter_privatized("max", row, own[..., :num_maxima], num_segments=table.shape[0])
     # Whole numbers: ordered scatters of floats cost accelerators more.
     whole = own[..., num_maxima:].astype(jnp.int32)
-    sums = _scatter_in_turn("add", row, whole, num_segments=table.shape[0])
+    sums = _scatter_privatized("add", row, whole, num_segments=table.shape[0])
     return jnp.concatenate([maxima, sums.astype(jnp.float32)], axis=1)
 
 
-def _scatter_in_turn(
+def _scatter_privatized(
     operation: Literal["add", "max", "min"], segment: jax.Array, values: jax.Array, *, num_segments: int
 ) -> jax.Array:
     """Sums, maxima or minima of the rows of each segment, on an accelerator.
 
-    It changes a number in memory by one row after the other, and neighbouring rows are often of one segment:
-    so they go to several tables in turn, which are joined. There are as many tables as cost little.
+    Atomic updates of one address are serialized (contention), and neighbouring rows are often of one segment:
+    they go to several private tables in turn, which are reduced. There are as many tables as cost little.
 
     Args:
       operation: what to do with the rows.
@@ -161,8 +161,8 @@ def fold_segments(
 
     def fold(table: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
         values = describe(*rows)
-        if on_accelerator():
-            return _scatter_in_turn(operation, rows[0], values, num_segments=num_segments)
+        if on_accelerator():  # Of all rows: there is nothing in the table yet.
+            return _scatter_privatized(operation, rows[0], values, num_segments=num_segments)
         return getattr(table.at[rows[0]], operation)(values, mode="drop")
 
     return fold_rows(fold, none, (segment, row), num_rows=num_rows, absent=(num_segments, absent))
@@ -175,7 +175,7 @@ def segment_minima(
 
     Args:
       values: (N,) float32.
-      segment: (N,) int32; values beyond the last segment are ignored.
+      segment: (N,) int32, not negative where valid; values beyond the last segment are ignored.
       valid: (N,) bool, values that count.
       num_segments: static, S.
 
@@ -184,7 +184,7 @@ def segment_minima(
     """
     if on_accelerator():
         segment = jnp.where(valid, segment, num_segments)
-        return _scatter_in_turn("min", segment, values[:, None], num_segments=num_segments)[:, 0]
+        return _scatter_privatized("min", segment, values[:, None], num_segments=num_segments)[:, 0]
     table = jnp.arange(values.shape[0], dtype=jnp.int32) % chunks.MINIMA_TABLES
     num_places = chunks.MINIMA_TABLES * num_segments
     # What lies past the last segment would be another table's.
