@@ -60,6 +60,7 @@ def _without_maps(*indices: int) -> dict[str, Any]:
 
 ABLATIONS = (
     # Points.
+    Ablation("read twice, turned", {"vehicles.num_readings": 2}),
     Ablation("no filter", {"filtering.enabled": False}),
     Ablation("one plane instead of the ground grid", {"ground.surface": False, **MORE_POINTS}),
     Ablation("ground grid of grade 0.2", {"ground.max_grade": 0.2}),

@@ -8,6 +8,7 @@ import functools
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 
 from jaxbox.config import DetectorConfig
 from jaxbox.stages import (
@@ -22,6 +23,7 @@ from jaxbox.stages import (
     ground,
     health,
     hull,
+    readings,
     rectangles,
     scoring,
 )
@@ -39,6 +41,7 @@ from jaxbox.stages.state import (
 )
 from jaxbox.types import Detections, PointCloud
 from jaxbox.xla.barriers import opaque_zeros, outline
+from jaxbox.xla.loops import map_batches
 
 
 class Segments(NamedTuple):
@@ -54,7 +57,31 @@ class Segments(NamedTuple):
 
 
 def find_vehicles(cloud: PointCloud, config: DetectorConfig, key: jax.Array) -> Detections:
-    """Finds the vehicles of one sweep.
+    """Finds the vehicles of one sweep, read once or several times.
+
+    Args:
+      cloud: of N rows.
+      config: of the detector.
+      key: JAX random key.
+
+    Returns:
+      The detections, best score first.
+    """
+    num_readings = config.vehicles.num_readings
+    if num_readings == 1:
+        return read(cloud, config, key)
+
+    def read_turned(angle: jax.Array) -> Detections:
+        turned = outline(readings.turn_sweep, cloud, angle, config.region)
+        return outline(readings.turn_back, read(turned, config, key), angle)
+
+    angles = jnp.deg2rad(readings.TURN_DEG * jnp.arange(num_readings, dtype=jnp.float32))
+    found = map_batches(read_turned, angles, chunk=1)
+    return outline(readings.merge_readings, found, config)
+
+
+def read(cloud: PointCloud, config: DetectorConfig, key: jax.Array) -> Detections:
+    """One reading of a sweep.
 
     Args:
       cloud: of N rows.

@@ -242,7 +242,8 @@ class Counts(ByValue):
     """True counts of the whole sweep: where each point went, and what each capacity had to hold.
 
     Every point of the source sweep is in exactly one of the first nine, so they sum to
-    `PointCloud.num_points`.
+    `PointCloud.num_points`. Where a sweep is read several times (``vehicles.num_readings``) these are of the
+    first reading, and what a capacity had to hold is the most of any.
     """
 
     dropped_points: jax.Array

@@ -300,3 +300,8 @@ def test_memory_that_was_freed_goes_back_to_the_system():
     held, left = map(float, done.stdout.split())
     assert held > 150
     assert left < 50
+
+
+def test_several_readings_have_no_halves(tmp_path, traced):
+    assert load(tmp_path, changed("vehicles", num_readings=2)) is None
+    assert not traced

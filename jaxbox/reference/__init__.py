@@ -101,6 +101,11 @@ from jaxbox.reference.hull import (
     outline_clusters,
     polygon_area,
 )
+from jaxbox.reference.readings import (
+    merge_readings,
+    turn_back,
+    turn_sweep,
+)
 from jaxbox.reference.rectangles import (
     best_rectangles,
     fit_rectangles,
@@ -258,6 +263,7 @@ __all__ = [
     "longer_side",
     "may_vote",
     "measure_health",
+    "merge_readings",
     "min_area_rectangle",
     "neighbourhood_score",
     "non_max_suppression",
@@ -293,6 +299,8 @@ __all__ = [
     "top_of",
     "track_step",
     "try_rotations",
+    "turn_back",
+    "turn_sweep",
     "visible_end",
     "weigh_boxes",
     "wrap_yaw",

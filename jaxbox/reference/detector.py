@@ -15,6 +15,7 @@ from jaxbox.reference import (
     ground,
     health,
     hull,
+    readings,
     scoring,
 )
 from jaxbox.reference import descriptors as shapes
@@ -41,9 +42,30 @@ def detect(
     >>> len(detect(np.zeros((0, 3))).score)
     0
     """
-    config = DetectorConfig() if config is None else config
+    config, xyz = DetectorConfig() if config is None else config, np.asarray(xyz, np.float64)
+    if config.vehicles.num_readings == 1:
+        return _read(xyz, config, seed)
+    found = []
+    for reading in range(config.vehicles.num_readings):
+        angle = np.radians(reading * readings.TURN_DEG)
+        turned = readings.turn_sweep(xyz, angle, config.region) if reading else xyz
+        found.append(readings.turn_back(_read(turned, config, seed), angle))
+    return readings.merge_readings(found, config)
+
+
+def _read(xyz: np.ndarray, config: DetectorConfig, seed: int) -> assembly.ReferenceDetections:
+    """One reading of a sweep.
+
+    Args:
+      xyz: (n, 3) float64, m, sensor frame.
+      config: the settings.
+      seed: of the RANSAC samples.
+
+    Returns:
+      What was found in it.
+    """
     # 3.1 Statistical filtering, and ground removal by RANSAC (Algorithm I).
-    sweep = filtering.select_points(np.asarray(xyz, np.float64), config.filtering, config.region)
+    sweep = filtering.select_points(xyz, config.filtering, config.region)
     terrain = ground.remove_ground(sweep, config.ground, np.random.default_rng(seed))
     obstacles = ground.gather_obstacles(sweep, terrain, config)
     # 3.2 Segmentation by 3D grid subdivision (Algorithm II).

@@ -130,6 +130,9 @@ class KeptPrograms:
         device = _common_device(operands)
         if device is None or jax.config.jax_disable_jit:  # pyright: ignore[reportAttributeAccessIssue]
             return None
+        # The halves are those of one reading.
+        if _num_readings(settings.structure) > 1:
+            return None
         num_rows = cloud.intensity.size
         if [operand.shape for operand in operands[:3]] != [(num_rows, 4), (num_rows,), ()]:
             return None
@@ -245,6 +248,12 @@ def source_digest() -> str:
     for path in sorted(root.rglob("*.py")):
         digest.update(f"{path.relative_to(root).as_posix()}\0".encode() + path.read_bytes())
     return digest.hexdigest()
+
+
+@functools.lru_cache(maxsize=64)
+def _num_readings(structure: Any) -> int:
+    """How often a sweep is read by a configuration of this structure."""
+    return jax.tree.unflatten(structure, range(structure.num_leaves)).vehicles.num_readings
 
 
 def _digest(data: bytes) -> str:

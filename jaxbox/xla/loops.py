@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.backend import batch_together, on_accelerator
 from jaxbox.xla.barriers import materialize
 
 
@@ -172,20 +172,20 @@ def fold_rows(
     return for_chunks(num_rows, chunk, step, state)
 
 
-def map_batches(function: Callable[[jax.Array], jax.Array], rows: jax.Array, *, chunk: int) -> jax.Array:
+def map_batches(function: Callable[[Any], Any], rows: Any, *, chunk: int) -> Any:
     """Applies a function to all rows, a chunk at a time on a CPU. Law: `jax.vmap(function)(rows)`.
 
     Args:
       function: of one row.
-      rows: (P, ...).
-      chunk: static, rows at a time.
+      rows: pytree of (P, ...) arrays.
+      chunk: static, rows at a time; a single one is not batched, so that its scatters stay as fast.
 
     Returns:
-      (P, ...).
+      Pytree of (P, ...) arrays.
     """
-    if on_accelerator():
+    if batch_together():
         return jax.vmap(function)(rows)
-    return jax.lax.map(function, rows, batch_size=chunk)
+    return jax.lax.map(function, rows, batch_size=None if chunk == 1 else chunk)
 
 
 def repeat(function: Callable[[Any], Any], state: Any, times: int) -> Any:
