@@ -17,7 +17,6 @@ Columns = Sequence[jax.Array]
 """What is reduced of a row: numbers () each, or (N,) of all rows."""
 
 _NEUTRAL = {"add": 0, "max": -jnp.inf, "min": jnp.inf}
-_JOINED = {"add": jnp.sum, "max": jnp.max, "min": jnp.min}
 
 
 def reduce_segments(
@@ -119,7 +118,10 @@ def _scatter_privatized(
     place = jnp.where(segment < num_segments, table * num_segments + segment, num_tables * num_segments)
     tables = jnp.full((num_tables * num_segments, columns), _NEUTRAL[operation], values.dtype)
     filled = getattr(tables.at[place], operation)(values, mode="drop")
-    return _JOINED[operation](filled.reshape(num_tables, num_segments, columns), axis=0)
+    filled = filled.reshape(num_tables, num_segments, columns)
+    if operation == "add":
+        return jnp.sum(filled, axis=0, dtype=values.dtype)
+    return (jnp.max if operation == "max" else jnp.min)(filled, axis=0)
 
 
 def _as_row(columns: tuple[Columns, Columns]) -> jax.Array:
