@@ -90,7 +90,11 @@ def test_settings_by_name_reach_the_detector(xyz):
         (("sweep.bin",), TypeError, r"jaxbox\.io\.read_points\('sweep.bin'\)"),
         ((pathlib.Path("sweep.bin"),), TypeError, r"jaxbox\.io\.read_points"),
         ((None,), TypeError, "NoneType"),
-        ((np.zeros((50, 3)), "papr"), ValueError, "not a preset; choose one of default, fast, paper"),
+        (
+            (np.zeros((50, 3)), "papr"),
+            ValueError,
+            "not a preset; choose one of default, accurate, fast, paper",
+        ),
         ((np.zeros((50, 3)), 7), TypeError, r"A seed is key=\.\.\."),
         ((np.zeros((50, 3)), None, "7"), TypeError, "give an integer"),
         ((np.zeros((50, 3)), None, True), TypeError, "give an integer"),

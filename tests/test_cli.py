@@ -388,7 +388,7 @@ def test_an_empty_sweep_is_no_failure_and_its_status_is_in_words(tmp_path):
         (("detect", "{tmp}", "--output", "{tmp}/out"), "no points"),
         (
             ("detect", "{tmp}", "--output", "{tmp}/out", "--preset", "best"),
-            "choose one of default, fast, paper",
+            "choose one of default, accurate, fast, paper",
         ),
         (("detect", "{tmp}", "--output", "{tmp}/out", "--format", "xml"), "xml"),
         (("detect", "{tmp}", "--output", "{tmp}/out", "--min-score", "2"), "min-score"),

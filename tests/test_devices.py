@@ -15,6 +15,8 @@ from jaxbox.xla import backend
 CAPACITY = 2**14
 MAX_LOOPS = 3
 """Loops until nothing changes: hooking of components, counting of neighbours, suppression."""
+MERGE_LOOPS = 1
+"""Suppression once more, where several readings are merged."""
 
 
 def text_for(platform, preset="default"):
@@ -27,7 +29,8 @@ def text_for(platform, preset="default"):
 def test_the_program_for_accelerators_hardly_waits_for_its_host(preset):
     # The host of a GPU waits at each turn of a loop, and at each conditional.
     text = text_for("cuda", preset)
-    assert text.count("stablehlo.while") <= MAX_LOOPS
+    several = DetectorConfig.presets()[preset].vehicles.num_readings > 1
+    assert text.count("stablehlo.while") <= MAX_LOOPS + several * MERGE_LOOPS
     assert text.count("stablehlo.case") == text.count("stablehlo.if") == 0
 
 

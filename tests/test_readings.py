@@ -19,7 +19,7 @@ from jaxbox.stages import readings
 from jaxbox.types import combine_bits
 from quality import bad_input
 
-TWICE = replace_fields(DetectorConfig(), {"vehicles.num_readings": 2})
+TWICE = DetectorConfig.accurate()
 SEEDS = range(3)
 
 
@@ -60,7 +60,7 @@ def test_readings_that_find_the_same_are_the_first(seed):
     assert_same_bits(merged(once(seed), once(seed)), once(seed))
 
 
-def test_the_better_of_two_boxes_of_a_vehicle_is_kept_with_the_points_of_its_reading():
+def test_the_better_of_two_boxes_of_a_vehicle_is_kept_with_the_points_of_its_reading_and_the_mean_score():
     first = once(0)
     assert first.valid.sum() > 10
     best = np.arange(len(first.score)) == 3
@@ -69,7 +69,9 @@ def test_the_better_of_two_boxes_of_a_vehicle_is_kept_with_the_points_of_its_rea
     owners[np.flatnonzero(first.point_detection == -1)[:5]] = 3
     second = shifted(
         first,
-        score=np.where(best, first.score[0] + 1e-3, 0.9 * first.score).astype(np.float32),
+        score=np.where(best, 2 * first.score[0] - first.score[3] + 1e-3, 0.9 * first.score).astype(
+            np.float32
+        ),
         center=first.center + np.float32(0.1) * best[:, None],
         point_detection=owners,
     )
@@ -79,6 +81,24 @@ def test_the_better_of_two_boxes_of_a_vehicle_is_kept_with_the_points_of_its_rea
     np.testing.assert_array_equal(d.point_detection == 0, second.point_detection == 3)
     assert d.num_points[0] == 5
     np.testing.assert_array_equal(d.center[1:4], first.center[:3])
+    means = [(first.score[3] + second.score[3]) / 2, *(0.95 * first.score[:3])]
+    np.testing.assert_allclose(d.score[:4], means, rtol=1e-6)
+
+
+def test_what_one_reading_alone_finds_scores_half_and_the_order_follows():
+    first = once(0)
+    best = np.arange(len(first.score)) == 0
+    away = np.where(best[:, None], np.float32([500, 0, 0]), 0).astype(np.float32)
+    d = merged(first, shifted(first, center=first.center + away))
+    num = int(first.valid.sum())
+    assert d.counts.detections == num + 1
+    alone = (
+        np.abs(d.center[:, None] - np.stack([first.center[0], first.center[0] + away[0]])).max(axis=2) == 0
+    )
+    np.testing.assert_array_equal(d.score[alone.any(axis=1)], [first.score[0] / 2] * 2)
+    others = ~alone.any(axis=1) & d.valid
+    np.testing.assert_array_equal(d.score[others], first.score[1:num])
+    assert (np.diff(d.score[d.valid]) <= 0).all()
 
 
 def test_boxes_far_apart_are_all_kept_as_far_as_there_is_room_and_counted():
@@ -123,13 +143,14 @@ def test_bits_of_capacities_are_those_of_any_reading_and_the_others_those_of_the
     assert Status(int(combine_bits(overflows))) == Status.ASSIGNMENT_OVERFLOW
 
 
-def test_a_reading_with_no_boxes_adds_nothing_and_boxes_keep_all_of_their_reading():
+def test_a_reading_with_no_boxes_halves_the_scores_and_boxes_keep_all_else_of_their_reading():
     boxes, none = once(1), parity.on_host(detect(cloud_of(np.zeros((0, 3)))))
     d = merged(none, boxes)
     for field in dataclasses.fields(d):
         of = none if field.name in d._of_sweep - {"point_detection", "counts"} else boxes
-        if field.name != "counts":
+        if field.name not in ("counts", "score"):
             assert_same_bits(getattr(d, field.name), getattr(of, field.name))
+    np.testing.assert_array_equal(d.score, boxes.score / 2)
     # Where the points went is that of the first reading, and what was needed is the most.
     needed = {row.count for row in CAPACITIES}
     for field in dataclasses.fields(d.counts):

@@ -78,7 +78,9 @@ def test_an_installation_runs_what_was_shipped_with_it_and_writes_nothing_into_i
 
 
 def test_each_preset_has_two_files_a_platform_and_they_fit(quick, tmp_path):
-    presets = DetectorConfig.presets().values()
+    presets = shipping.shipped_presets().values()
+    assert DetectorConfig() in presets
+    assert DetectorConfig.accurate() not in presets
     assert str(shipped_state(tmp_path)) == "none"
     written = ship_programs(tmp_path, list(presets))
     assert len(set(written)) == 2 * len(presets) * len(shipping.PLATFORMS)

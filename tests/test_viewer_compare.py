@@ -289,7 +289,7 @@ def test_the_command_compares_presets_files_and_sweeps(folder, tmp_path, monkeyp
     message = " ".join(wrong.stderr.split())
     assert "--compare: " in message
     assert "papr: there is no such file" in message
-    assert "a preset (default, fast, paper)" in message
+    assert "a preset (default, accurate, fast, paper)" in message
 
 
 @pytest.mark.parametrize(

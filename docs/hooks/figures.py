@@ -69,6 +69,30 @@ def accuracy() -> str:
     return table(["", *names], rows) + made_with(default)
 
 
+def readings() -> str:
+    """The default next to the preset that reads a sweep twice."""
+    columns = [_preset_figures("accuracy_default", ""), _preset_figures("accuracy_accurate", "_accurate")]
+    rows = [(name, *(column[name] for column in columns)) for name in columns[0]]
+    return table(["", "default", "accurate"], rows) + made_with(load("accuracy_accurate"))
+
+
+def _preset_figures(accuracy_of_20: str, ending: str) -> dict[str, float]:
+    """Accuracy of a preset, what it finds with other sensors, and how steady it is, in % each."""
+    names = ["SOFT", "3d easy", "3d moderate", "3d hard", "bev moderate"]
+    figures = {
+        f"{frames} frames: {name}": load(report)["summary"]["mean of all"][name]
+        for frames, report in ((20, accuracy_of_20), (58, f"accuracy_unseen{ending}"))
+        for name in names
+    }
+    pooled = load(f"sensors{ending}")["pooled"]
+    cut = next(row for row in pooled["cuts"] if row["min_score"] == pooled["library_cut"])
+    figures["other sensors: recall of cars"] = 100 * cut["recall_cars"]
+    figures["other sensors: precision"] = 100 * cut["precision"]
+    for change, by_score in load(f"steadiness{ending}")["boxes"].items():
+        figures[f"boxes that stay: {change}"] = 100 * by_score["0.3"]["stay"]
+    return figures
+
+
 def ap(values: dict[str, float], names: Sequence[str]) -> list[float]:
     """In the order of the header."""
     return [values[name] for name in names]
@@ -682,6 +706,7 @@ def takes(name: str, field: dataclasses.Field[Any]) -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "accuracy": accuracy,
+    "readings": readings,
     "sizes": sizes,
     "paper": paper_table,
     "sensors": sensors,

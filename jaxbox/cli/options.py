@@ -31,7 +31,7 @@ AddressOption = Annotated[
 PresetOption = Annotated[
     str | None,
     typer.Option(
-        help="Settings to start from: default, fast, or paper for the paper's choices.",
+        help="Settings to start from: default, accurate (twice the time), fast, or paper (its choices).",
         autocompletion=complete_preset,
     ),
 ]

@@ -1,4 +1,4 @@
-"""Several readings of one sweep, each turned about the sensor: of the boxes of a vehicle the best is kept."""
+"""Several readings of one sweep, each turned about the sensor: the best boxes, with the mean scores."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -13,6 +13,9 @@ from jaxbox.reference.scoring import non_max_suppression
 
 TURN_DEG = 7.3
 """Each reading is turned so much farther about +z."""
+
+SAME_VEHICLE_M = 1.4
+"""Boxes of two readings whose centres are nearer are of one vehicle."""
 
 
 def turn_sweep(xyz: np.ndarray, angle: float, region: RegionConfig) -> np.ndarray:
@@ -51,7 +54,7 @@ def turn_back(detections: ReferenceDetections, angle: float) -> ReferenceDetecti
 
 
 def merge_readings(found: Sequence[ReferenceDetections], config: DetectorConfig) -> ReferenceDetections:
-    """The best boxes of all readings that overlap no better one.
+    """The best boxes of all readings that overlap no better one, with the mean of their scores.
 
     Args:
       found: of each reading, turned back.
@@ -64,13 +67,16 @@ def merge_readings(found: Sequence[ReferenceDetections], config: DetectorConfig)
     parts = [np.column_stack([d.center[:, :2], d.size[:, :2], d.yaw]) for d in found]
     boxes, scores = np.concatenate(parts), np.concatenate([d.score for d in found])
     rows = non_max_suppression(boxes, scores, max_overlap=float(config.vehicles.max_overlap))
-    kept = rows[: config.vehicles.max_detections]
+    rows_kept = rows[: config.vehicles.max_detections]
+    mean = np.array([_mean_score(boxes[row, :2], found) for row in rows_kept])
+    by_score = np.argsort(-mean, kind="stable")
+    kept, mean = rows_kept[by_score], mean[by_score]
     point_detection = np.full(len(found[0].point_detection), -1)
     # The best box comes last, and has the point.
     for place in reversed(range(len(kept))):
         reading, row = origin[kept[place]]
         point_detection[found[reading].point_detection == row] = place
-    of_box = ("center", "size", "yaw", "heading", "front_probability", "score", "label")
+    of_box = ("center", "size", "yaw", "heading", "front_probability", "label")
     counts = {
         name: tuple(np.max([d.counts[name] for d in found], axis=0).tolist())
         if isinstance(found[0].counts[name], tuple)
@@ -81,12 +87,19 @@ def merge_readings(found: Sequence[ReferenceDetections], config: DetectorConfig)
     return dataclasses.replace(
         found[0],
         **{name: np.concatenate([getattr(d, name) for d in found])[kept] for name in of_box},
+        score=mean,
         hulls=tuple(found[origin[row][0]].hulls[origin[row][1]] for row in kept),
         descriptors=tuple(found[origin[row][0]].descriptors[origin[row][1]] for row in kept),
         num_points=np.array([(point_detection == place).sum() for place in range(len(kept))], int),
         point_detection=point_detection,
         counts=found[0].counts | counts,
     )
+
+
+def _mean_score(xy: np.ndarray, found: Sequence[ReferenceDetections]) -> float:
+    """The mean over all readings of the best score that each gives a box with this centre, (2,) m."""
+    near = [d.score[np.linalg.norm(d.center[:, :2] - xy, axis=1) < SAME_VEHICLE_M] for d in found]
+    return float(np.mean([scores.max(initial=0) for scores in near]))
 
 
 def _rotation(angle: float) -> np.ndarray:

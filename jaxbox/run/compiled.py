@@ -42,7 +42,8 @@ def detect(
     Args:
       cloud: one sweep, see `PointCloud.from_numpy`; or an array (n, 3 or more) of x, y, z in m, sensor frame,
         and where there are more columns the intensity.
-      config: the configuration, or the name of a preset: "default", "fast" or "paper"; None for the default.
+      config: the configuration, or the name of a preset: "default", "accurate", "fast" or "paper"; None
+        for the default.
       key: JAX random key for RANSAC, or an integer, its seed; None for 0. On a CPU the same key gives the
         same bits.
 

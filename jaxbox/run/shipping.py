@@ -107,9 +107,14 @@ def _misfit(path: pathlib.Path) -> str | None:
     return None
 
 
+def shipped_presets() -> dict[str, DetectorConfig]:
+    """The presets whose programs can be shipped: those that read a sweep once, see `KeptPrograms`."""
+    return {name: c for name, c in DetectorConfig.presets().items() if c.vehicles.num_readings == 1}
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Writes the programs into the package, and prints their files."""
-    presets = DetectorConfig.presets()
+    presets = shipped_presets()
     parser = argparse.ArgumentParser(description="Traces programs into the package, for a wheel of it.")
     parser.add_argument("--presets", nargs="+", choices=presets, default=list(presets))
     parser.add_argument("--platforms", nargs="+", default=list(PLATFORMS))

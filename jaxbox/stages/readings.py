@@ -1,7 +1,8 @@
-"""Several readings of one sweep, each turned about the sensor: of the boxes of a vehicle the best is kept.
+"""Several readings of one sweep, each turned about the sensor: the best boxes, with the mean scores.
 
 Where the cells of a map, the azimuths of the evidence and the angles of rectangles lie is chance: a car that
-one reading splits, or joins to a hedge, may be whole in another.
+one reading splits, or joins to a hedge, may be whole in another, and a hedge that passes for a car in one may
+pass for none in another.
 """
 
 import dataclasses
@@ -11,14 +12,17 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.config import DetectorConfig, RegionConfig
-from jaxbox.geometry.planar import rectangle_iou, rotate, wrap_turn, wrap_yaw
+from jaxbox.geometry.planar import rotate, wrap_turn, wrap_yaw
+from jaxbox.stages._suppression import non_max_suppression
 from jaxbox.types import Counts, Detections, PointCloud, combine_bits
 from jaxbox.xla.rows import compact, take
 from jaxbox.xla.sorting import best_first
-from jaxbox.xla.suppression import suppress_conflicts
 
 TURN_DEG = 7.3
 """Each reading is turned so much farther about +z: no grid or angle step divides it."""
+
+SAME_VEHICLE_M = 1.4
+"""Boxes of two readings with nearer centres are of one vehicle; cars side by side are farther apart."""
 
 
 def turn_sweep(cloud: PointCloud, angle: jax.Array, region: RegionConfig) -> PointCloud:
@@ -65,23 +69,24 @@ def turn_back(detections: Detections, angle: jax.Array) -> Detections:
 
 
 def merge_readings(found: Detections, config: DetectorConfig) -> Detections:
-    """The best boxes of all readings that overlap no better one.
+    """The best boxes of all readings that overlap no better one, with the mean of their scores.
 
-    A point belongs to the best of them that has it in its own reading; hulls and descriptors are those of
-    that reading. What is said of the sweep, and where its points went, is that of the first reading.
+    A reading without a box of a vehicle scores it 0. A point belongs to the best box that has it in its own
+    reading; hulls and descriptors are those of that reading. What is said of the sweep, and where its points
+    went, is that of the first reading.
 
     Args:
       found: of R readings, turned back; all arrays have a leading axis R.
       config: the overlap, and the capacities.
 
     Returns:
-      K rows, as one reading has. Of equal scores the earlier reading's goes first.
+      K rows, as one reading has. Of boxes with equal scores the earlier reading's is kept.
 
     Reference: oracle `jaxbox.reference.merge_readings`.
     """
     first = jax.tree.map(lambda a: a[0], found)
     num_kept = first.valid.shape[0]
-    row, num = _best_rows(found, config)
+    row, score, num = _best_rows(found, config)
     counts = _most_needed(found.counts, first.counts, num)
     overflows = counts.overflows(config, first.ground_mask.shape[0])
     status = (first.status & ~sum(map(int, overflows))) | combine_bits(overflows)
@@ -100,7 +105,7 @@ def merge_readings(found: Detections, config: DetectorConfig) -> Detections:
         yaw=best(found.yaw),
         heading=best(found.heading),
         front_probability=best(found.front_probability, 0.5),
-        score=best(found.score),
+        score=score,
         label=best(found.label),
         valid=best(found.valid),
         num_points=num_points,
@@ -117,17 +122,45 @@ def _flat(rows: jax.Array) -> jax.Array:
     return rows.reshape(-1, *rows.shape[2:])
 
 
-def _best_rows(found: Detections, config: DetectorConfig) -> tuple[jax.Array, jax.Array]:
-    """(K,) int32 rows that overlap no better one, best first, their number beyond; and how many there are."""
-    score = _flat(jnp.where(found.valid, found.score, 0))
-    num_rows = score.size
-    order = best_first(score, jnp.int32(num_rows))
+def _best_rows(found: Detections, config: DetectorConfig) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The boxes that overlap no better one.
+
+    Args:
+      found: of R readings of K rows.
+      config: the overlap.
+
+    Returns:
+      row: (K,) int32, best mean score first, the number of all rows beyond the last box.
+      score: (K,) float32, the mean scores.
+      num: () int32, how many boxes there are.
+    """
+    scores = jnp.where(found.valid, found.score, 0)
+    num_rows = scores.size
+    order = best_first(_flat(scores), jnp.int32(num_rows))
     flat = jnp.concatenate([found.center[..., :2], found.size[..., :2], found.yaw[..., None]], axis=2)
-    most = config.vehicles.max_overlap
-    rectangles, valid = take(_flat(flat), order), order < num_rows
-    keep = suppress_conflicts(rectangles, valid, lambda a, b: rectangle_iou(a, b) > most)
+    boxes = take(_flat(flat), order)
+    keep = non_max_suppression(boxes, order < num_rows, max_overlap=config.vehicles.max_overlap)
     place, num = compact(keep, found.valid.shape[1])
-    return take(order, place, num_rows), num
+    row, kept = take(order, place, num_rows), take(boxes, place)
+    score = jnp.where(row < num_rows, _mean_scores(kept[:, :2], found.center[..., :2], scores), 0)
+    order = best_first(score, jnp.int32(score.size))
+    return take(row, order, num_rows), take(score, order), num
+
+
+def _mean_scores(xy: jax.Array, centers: jax.Array, scores: jax.Array) -> jax.Array:
+    """The mean over all readings of the best score that each gives a box.
+
+    Args:
+      xy: (K, 2) m, centres of the boxes.
+      centers: (R, K, 2) m, of the boxes of each reading.
+      scores: (R, K), of the same.
+
+    Returns:
+      (K,) float32.
+    """
+    apart_m = jnp.linalg.norm(centers[:, None] - xy[None, :, None], axis=3)
+    best = jnp.max(jnp.where(apart_m < SAME_VEHICLE_M, scores[:, None], 0), axis=2)
+    return jnp.mean(best, axis=0)
 
 
 def _owners(point_detection: jax.Array, row: jax.Array, num_kept: int) -> jax.Array:

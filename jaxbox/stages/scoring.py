@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, VehicleConfig
-from jaxbox.geometry.planar import rectangle_iou, wrap_yaw
+from jaxbox.geometry.planar import wrap_yaw
 from jaxbox.stages._assignments import share_seen
 from jaxbox.stages._priors import asymmetric_gaussian, closed_free_length, prior_of, size_score
 from jaxbox.stages._rows import hit_share
+from jaxbox.stages._suppression import non_max_suppression
 from jaxbox.stages._surroundings import cluster_alone, count_points_around, sensor_from
 from jaxbox.stages.state import (
     NOT_A_BOX,
@@ -30,7 +31,6 @@ from jaxbox.xla import chunks
 from jaxbox.xla.loops import map_rows
 from jaxbox.xla.rows import compact, take
 from jaxbox.xla.sorting import best_first, select_highest
-from jaxbox.xla.suppression import suppress_conflicts
 
 PSEUDO_COUNT = 5
 """Upper points that are added before the share behind the faces is taken, at the share of the full score, so
@@ -395,19 +395,3 @@ def _unseen_top_score(
     score = asymmetric_gaussian(jnp.maximum(prior.height_m, top), prior.height_m, *widths)
     score = config.unseen_top_score * jnp.maximum(cut, bumper) * score
     return jnp.where(top < prior.max_height_m, score, 0)
-
-
-def non_max_suppression(boxes: jax.Array, valid: jax.Array, *, max_overlap: jax.Array | float) -> jax.Array:
-    """Keeps each box that overlaps no better one that is kept (greedy non-maximum suppression).
-
-    Args:
-      boxes: (P, 5) float32: x, y, length, width, yaw; best first.
-      valid: (P,) bool, rows that hold a box, all before the others.
-      max_overlap: largest bird's-eye view IoU of two boxes that are both kept.
-
-    Returns:
-      (P,) bool.
-
-    Reference: oracle `jaxbox.reference.non_max_suppression`.
-    """
-    return suppress_conflicts(boxes, valid, lambda a, b: rectangle_iou(a, b) > max_overlap)
