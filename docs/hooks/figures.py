@@ -90,7 +90,13 @@ def _preset_figures(accuracy_of_20: str, ending: str) -> dict[str, float]:
     figures["other sensors: precision"] = 100 * cut["precision"]
     for change, by_score in load(f"steadiness{ending}")["boxes"].items():
         figures[f"boxes that stay: {change}"] = 100 * by_score["0.3"]["stay"]
-    return figures
+    rows = load(f"situations{ending}")["rows"]
+    return figures | {
+        f"situations: vehicles {outcome}": 100
+        * sum(row[outcome] for row in rows)
+        / sum(row["vehicles"] for row in rows)
+        for outcome in ("found", "silent")
+    }
 
 
 def ap(values: dict[str, float], names: Sequence[str]) -> list[float]:
