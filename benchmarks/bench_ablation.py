@@ -120,6 +120,8 @@ ABLATIONS = (
     Ablation("upright things not told from cars", {"vehicles.upright_score": 1.0}),
     Ablation("vans from 2.0 m on", {"vehicles.classes.1.min_height_m": 2.0}),
     Ablation("no ground support", {"vehicles.support_points": 1 / NO_LIMIT}),
+    Ablation("as much ground support at every range", {"vehicles.support_range_m": NO_LIMIT}),
+    Ablation("what is high and upright as any wall", {"vehicles.tall_upright_score": 0.2}),
     Ablation("no sparseness", {"vehicles.sparseness_power": 0.0}),
     Ablation("height gate that does not widen with range", {"vehicles.top_grade": 0.0}),
     Ablation("cars only, no vans and trucks", {"vehicles.large_height_m": NO_LIMIT}),

@@ -103,7 +103,7 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
 @jax.jit
 def score_boxes(columns, prior):
     around = NeighbourhoodCounts(jnp.stack(columns["around"], axis=1))
-    seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "objective"))
+    seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "rho", "objective"))
     where = (columns[name] for name in ("rho", "reach", "seen_width", "is_open"))
     early = scoring.evidence_score(*seen, SETTINGS)
     late, top_unseen = scoring.neighbourhood_score(around, *where, prior, SETTINGS)

@@ -923,6 +923,9 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     assert score(prior=dataclasses.replace(CAR, prior_weight=0.5)) == 0.5
     assert score(free_length=0.15) == pytest.approx(np.exp(-1))
     assert score(support=4.5) == pytest.approx(0.5)
+    # Twice as far away an eighth of the points say as much.
+    assert score(moved(PERFECT_BOX, x=40), support=4.5) == pytest.approx(0.5)
+    assert score(moved(PERFECT_BOX, x=90), support=0.125) == pytest.approx(0.5)
     assert score(objective=2.4) == pytest.approx(0.5)
     assert score(around=dataclasses.replace(around, num_ring=25)) == pytest.approx(np.exp(-2))
     assert score(around=dataclasses.replace(around, top=2.1)) == pytest.approx(np.exp(-1))
@@ -964,6 +967,22 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     assert score(moved(PERFECT_BOX, x=30), around=dataclasses.replace(around, top=0.39)) == 0
     as_vans = dataclasses.replace(CAR, min_bumper_m=10.0)
     assert score(moved(PERFECT_BOX, x=30), around=bumper, prior=as_vans) == 0
+
+
+def test_the_rear_of_a_high_car_may_be_upright_where_its_width_was_measured():
+    around = dataclasses.replace(PERFECT["around"], num_upper=10**6)
+
+    def upright(top, *, measured_m=1.63, prior=CAR):
+        high = dataclasses.replace(around, top=top)
+        by_height = np.exp(-(((top - 1.5) / 0.6) ** 2))
+        return score_of(prior=prior, around=high, measured=(1.2, measured_m)) / by_height
+
+    np.testing.assert_allclose(
+        [upright(top) for top in (1.5, 1.75, 1.8, 1.85, 2.1)], [0.2, 0.2, 0.3, 0.4, 0.4], rtol=1e-4
+    )
+    assert upright(1.9, measured_m=0.7 * 1.63) == pytest.approx(0.3, rel=1e-4)
+    assert upright(1.9, measured_m=0.6 * 1.63) == pytest.approx(0.2, rel=1e-4)
+    assert upright(1.9, prior=dataclasses.replace(CAR, upright_from_m=10.0)) == pytest.approx(0.2, rel=1e-4)
 
 
 def test_what_may_be_a_wall_is_a_truck_as_far_as_beams_pass_below():

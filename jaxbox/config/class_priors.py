@@ -61,6 +61,9 @@ class ClassPrior:
     recess_m: Scalar
     """Glass, bonnet and roof lie farther than this behind the faces that the sensor sees; walls, hedges
     and fences are upright. -1 asks for nothing."""
+    upright_from_m: Scalar
+    """From this height on, in full .1 m higher, a rear may be upright: compact vans look like high cars. See
+    ``vehicles.tall_upright_score``; more than any height for classes that have no such vehicles."""
     past_ends_m: Scalar
     """Points so much farther past the ends of the box speak against it too, see ``vehicles.ring_m``: walls
     and facades go on there. Those up to .6 m before the end that the sensor sees are its own."""
@@ -177,6 +180,7 @@ class Label(enum.IntEnum):
         prior_weight=1.0,
         count_max_height_m=2.2,
         recess_m=0.3,
+        upright_from_m=1.75,
         past_ends_m=0.0,
         open_below=0.0,
         min_open=0.0,
@@ -200,6 +204,7 @@ class Label(enum.IntEnum):
         prior_weight=0.5,
         count_max_height_m=2.7,
         recess_m=0.15,
+        upright_from_m=10.0,
         past_ends_m=0.0,
         open_below=0.0,
         min_open=0.0,
@@ -223,6 +228,7 @@ class Label(enum.IntEnum):
         prior_weight=0.5,
         count_max_height_m=4.2,
         recess_m=-1.0,
+        upright_from_m=10.0,
         past_ends_m=2.0,
         open_below=1.0,
         min_open=0.05,

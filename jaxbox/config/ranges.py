@@ -61,7 +61,7 @@ _POSITIVE = """
     vehicles.classes.height_below_m vehicles.classes.height_above_m
     vehicles.classes.max_height_m vehicles.classes.max_length_m vehicles.classes.max_width_m
     vehicles.classes.count_max_height_m
-    vehicles.saturation_points vehicles.support_points vehicles.recess_share
+    vehicles.saturation_points vehicles.support_points vehicles.support_range_m vehicles.recess_share
     vehicles.free_scale vehicles.objective_softness vehicles.overhead_gap_m
     gate acceleration_mps2 position_sd_m birth_speed_sd_mps max_gap_s max_ego_speed_mps
 """
@@ -72,7 +72,8 @@ _SHARES = """
     completion.seen_weight
     health.min_far_share health.max_scattered_share health.max_rough_share health.max_under_share
     vehicles.hidden_length_score vehicles.unseen_top_score vehicles.classes.min_open
-    vehicles.top_quantile vehicles.upright_score vehicles.min_score vehicles.max_overlap
+    vehicles.tall_upright_score vehicles.top_quantile vehicles.upright_score
+    vehicles.min_score vehicles.max_overlap
     birth_score high_score low_score hidden_share yaw_memory yaw_memory_moving turn_gain
 """
 

@@ -378,8 +378,13 @@ class VehicleConfig:
     """Share of the upper points behind the faces from which the score is full."""
     upright_score: Scalar = 0.2
     """score x a factor from this, where all upper points are on the faces, to 1."""
+    tall_upright_score: Scalar = 0.4
+    """The same for what is as high as ``ClassPrior.upright_from_m`` where nearly the class's width was
+    measured."""
     support_points: Scalar = 10.0
     """score x min(1, ground points round the box / this)."""
+    support_range_m: Scalar = 50.0
+    """Beyond this range fewer are asked for, by its cube: the road returns fewer, in rings far apart."""
     objective_gate: Scalar = 2.4
     """score / (1 + exp(-(J - gate) / softness)), J the objective of the completion."""
     objective_softness: Scalar = 0.1

@@ -28,6 +28,7 @@ PSEUDO_COUNT = 5
 """Pseudo-count: upper points that are added, with the share of the full score behind the faces."""
 CUT_SLACK_M = 0.1
 """Tops from so much below the highest beam on are more and more taken to be cut off by it."""
+UPRIGHT_RAMP_M = 0.1
 BUMPER_RAMP_M, BUMPER_WIDTHS = 10.0, (0.6, 0.8)
 """A far box may be a bumper alone: the more the farther over so much range, and the wider between these
 shares of the class's width."""
@@ -244,7 +245,8 @@ def early_score(
     """The part of the score that needs no look at what surrounds the box; see `score_box`."""
     if max(box.measured_length_m, box.measured_width_m) < config.min_extent_m:
         return 0.0
-    score = evidence_score(num_points, hit, free_length, support, box.objective, config)
+    rho = float(np.hypot(box.box[0], box.box[1]))
+    score = evidence_score(num_points, hit, free_length, support, rho, box.objective, config)
     return float(score * size_score(box.box[2:4], prior) * prior.prior_weight)
 
 
@@ -258,6 +260,7 @@ def evidence_score(
     hit: float,
     free_length: float,
     support: float | None,
+    rho: float,
     objective: float,
     config: VehicleConfig,
 ) -> float:
@@ -268,9 +271,10 @@ def evidence_score(
       hit: share of the rays that end at the box.
       free_length: share of the box seen to be free.
       support: ground points round the box, or None where they were not counted.
+      rho: m, range of the box.
       objective: J of the completion.
       config: (points / saturation)^power, exp(-(free_length / scale)^2), full score from a number of ground
-        points, and 1 / (1 + exp(-(J - gate) / softness)).
+        points, x (range / rho)^3 beyond a range, and 1 / (1 + exp(-(J - gate) / softness)).
 
     Returns:
       In [0, 1].
@@ -278,7 +282,8 @@ def evidence_score(
     score = hit * min(1.0, num_points / config.saturation_points) ** config.sparseness_power
     score *= np.exp(-((free_length / config.free_scale) ** 2))
     if support is not None:
-        score *= min(1.0, (support + 0.5) / config.support_points)
+        thinned = max(1.0, rho / config.support_range_m) ** 3
+        score *= min(1.0, (support + 0.5) * thinned / config.support_points)
     return float(score * expit((objective - config.objective_gate) / config.objective_softness))
 
 
@@ -321,8 +326,9 @@ def neighbourhood_score(
         off, or was measured to less than `WIDE` of the class's width, is rather a wall.
       prior: of the class.
       config: exp(-(ring weight x ring + overhead weight x above) / inside), and a factor from
-        `upright_score`, where no upper point is recessed, to 1 from the share `recess_share` on. Points above
-        do not count where the top is twice `overhead_gap_m` below `count_max_height_m`.
+        `upright_score`, or `tall_upright_score` of what is high, where no upper point is recessed, to 1 from
+        the share `recess_share` on. Points above do not count where the top is twice `overhead_gap_m` below
+        `count_max_height_m`.
 
     Returns:
       In [0, 1], 0 where a gate of the class closes; and whether it is that of a box whose top is out of
@@ -347,7 +353,10 @@ def neighbourhood_score(
     score *= np.exp(-clutter / max(around.num_inside, 1))
     share = around.num_recessed + PSEUDO_COUNT * config.recess_share
     share = share / (around.num_upper + PSEUDO_COUNT)
-    upright = config.upright_score + (1 - config.upright_score) * min(1.0, share / config.recess_share)
+    tall = np.interp(around.top - prior.upright_from_m, [0, UPRIGHT_RAMP_M], [0, 1])
+    tall *= np.interp(seen_width, BUMPER_WIDTHS, [0, 1])
+    least = config.upright_score + (config.tall_upright_score - config.upright_score) * tall
+    upright = least + (1 - least) * min(1.0, share / config.recess_share)
     return float(score * upright), unseen > seen
 
 

@@ -42,6 +42,9 @@ CUT_SLACK_M, NOT_CUT_M = 0.1, 1e6
 passes when nothing is known of it."""
 
 
+UPRIGHT_RAMP_M = 0.1
+"""So much above the least height of an upright rear it is one in full."""
+
 BUMPER_RAMP_M, BUMPER_WIDTHS = 10.0, (0.6, 0.8)
 """What is seen of a far vehicle is more and more often a bumper alone: over so much range; and between these
 fractions of the class's width it is believed to be one."""
@@ -142,7 +145,8 @@ def _early_scores(
             hit, free_length = hit_share(rays[0], boxes.in_row), closed_free_length(rays[0], prior)
             support = rays[1]
         num_points = take(clusters.num_points, cluster)
-        by_evidence = evidence_score(num_points, hit, free_length, support, boxes.objective, config)
+        rho = jnp.linalg.norm(boxes.center, axis=1)
+        by_evidence = evidence_score(num_points, hit, free_length, support, rho, boxes.objective, config)
         by_size = size_score(boxes.length, boxes.width, prior)
         score = by_evidence * by_size * prior.prior_weight
         large_enough = jnp.max(boxes.measured, axis=1) >= config.min_extent_m
@@ -248,6 +252,7 @@ def evidence_score(
     hit: jax.Array,
     free_length: jax.Array,
     support: jax.Array,
+    rho: jax.Array,
     objective: jax.Array,
     config: VehicleConfig,
 ) -> jax.Array:
@@ -258,16 +263,18 @@ def evidence_score(
       hit: (P,) float32, fraction of rays.
       free_length: (P,) float32, fraction of the rays' length.
       support: (P,) float32, ground points round the box.
+      rho: (P,) float32, m, range of the box.
       objective: (P,) float32, J of the box.
       config: (points / saturation)^power, exp(-(free_length / scale)^2), full score from that many ground
-        points, and 1 / (1 + exp(-(J - gate) / softness)).
+        points, x (range / rho)^3 beyond a range, and 1 / (1 + exp(-(J - gate) / softness)).
 
     Returns:
       (P,) float32 in [0, 1].
     """
     dense = jnp.minimum(num_points.astype(jnp.float32) / config.saturation_points, 1)
     dense = dense**config.sparseness_power
-    grounded = jnp.minimum((support + 0.5) / config.support_points, 1)
+    thinned = jnp.maximum(rho / config.support_range_m, 1)
+    grounded = jnp.minimum((support + 0.5) * thinned**3 / config.support_points, 1)
     gate = jax.nn.sigmoid((objective - config.objective_gate) / config.objective_softness)
     return dense * jnp.exp(-((free_length / config.free_scale) ** 2)) * hit * grounded * gate
 
@@ -363,10 +370,23 @@ def neighbourhood_score(
     score = score * jnp.exp(-clutter)
     recessed = around.num_recessed + PSEUDO_COUNT * config.recess_share
     recessed = recessed / (around.num_upper + PSEUDO_COUNT)
-    upright = config.upright_score + (1 - config.upright_score) * jnp.minimum(
-        recessed / config.recess_share, 1
-    )
+    least = _upright_score(around.top, seen_width, prior, config)
+    upright = least + (1 - least) * jnp.minimum(recessed / config.recess_share, 1)
     return score * upright, top_unseen
+
+
+def _upright_score(
+    top: jax.Array, seen_width: jax.Array, prior: ClassPrior, config: VehicleConfig
+) -> jax.Array:
+    """(P,) the factor of what is upright all over; `seen_width` is a fraction of the class's."""
+    tall = jnp.clip((top - prior.upright_from_m) / UPRIGHT_RAMP_M, 0, 1) * _nearly_wide(seen_width)
+    return config.upright_score + (config.tall_upright_score - config.upright_score) * tall
+
+
+def _nearly_wide(seen_width: jax.Array) -> jax.Array:
+    """(P,) in [0, 1]: whether nearly the class's width was measured."""
+    narrow, wide = BUMPER_WIDTHS
+    return jnp.clip((seen_width - narrow) / (wide - narrow), 0, 1)
 
 
 def _height_score(top: jax.Array, highest: jax.Array, prior: ClassPrior) -> jax.Array:
@@ -387,9 +407,7 @@ def _unseen_top_score(
     """(P,) the same where the top is out of sight; `seen_width` is a fraction of the class's."""
     cut = cut * jnp.clip(2 * seen_width, 0, 1)
     cut = jnp.where(top > prior.min_cut_height_m, cut, 0)
-    narrow, wide = BUMPER_WIDTHS
-    bumper = jnp.clip((rho - config.bumper_from_m) / BUMPER_RAMP_M, 0, 1)
-    bumper = bumper * jnp.clip((seen_width - narrow) / (wide - narrow), 0, 1)
+    bumper = jnp.clip((rho - config.bumper_from_m) / BUMPER_RAMP_M, 0, 1) * _nearly_wide(seen_width)
     bumper = jnp.where(top > prior.min_bumper_m, bumper, 0)
     widths = prior.height_below_m, prior.height_above_m
     score = asymmetric_gaussian(jnp.maximum(prior.height_m, top), prior.height_m, *widths)
