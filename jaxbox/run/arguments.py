@@ -10,6 +10,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbox._padding import unmasked
 from jaxbox.config import DetectorConfig
 from jaxbox.types import PointCloud
 
@@ -83,7 +84,7 @@ def as_points(points: Any, *, called: str) -> tuple[np.ndarray, np.ndarray | Non
 
     Args:
       points: (n, 3) or more columns, real numbers: x, y, z in m, sensor frame, and where there are more the
-        intensity; whatever NumPy can make an array of.
+        intensity; whatever NumPy can make an array of. Masked numbers are NaN, masked intensities 0.
       called: the function that was given them, for the message.
 
     Returns:
@@ -104,14 +105,15 @@ def as_points(points: Any, *, called: str) -> tuple[np.ndarray, np.ndarray | Non
         )
     if hasattr(points, "read_points"):
         raise TypeError(f"{called} takes points: read the sweep's, xyz, intensity = sweep.read_points().")
-    array = np.asarray(points)
+    array = points if isinstance(points, np.ma.MaskedArray) else np.asarray(points)
     if array.dtype.kind not in "fiu":
         kind = f"{type(points).__qualname__} of {type(points).__module__}"
         raise TypeError(f"{called} takes an array (n, 3) of real numbers or a PointCloud; this is {kind}.")
     if array.ndim != 2 or not _COLUMNS <= array.shape[1] <= _MAX_COLUMNS:
         fix = _fix_of(array)
         raise ValueError(f"the points have shape {array.shape}; it must be (n, 3) or more columns{fix}.")
-    return array[:, :_COLUMNS], array[:, _COLUMNS] if array.shape[1] > _COLUMNS else None
+    intensity = array[:, _COLUMNS] if array.shape[1] > _COLUMNS else None
+    return unmasked(array[:, :_COLUMNS], np.nan), unmasked(intensity, 0)
 
 
 def _fix_of(array: np.ndarray) -> str:
@@ -154,6 +156,8 @@ class ReadSweep:
     """(n, 3) float32, m, sensor frame."""
     intensity: np.ndarray | None
     """(n,) float32, or None."""
+    num_dropped: int = 0
+    """Points that a cloud had no room for, and that are not among these."""
 
     def read_points(self) -> tuple[np.ndarray, np.ndarray | None]:
         """The points."""
@@ -186,6 +190,8 @@ def _as_sweep(sweep: Any, index: int, called: str) -> Any:
         return sweep
     name = f"{index:06d}"
     if isinstance(sweep, PointCloud):
-        rows = np.asarray(sweep.xyz1)[: int(sweep.num_points)]
-        return ReadSweep(name, rows[:, :_COLUMNS], np.asarray(sweep.intensity)[: len(rows)])
+        num_points = int(sweep.num_points)
+        rows = np.asarray(sweep.xyz1)[:num_points]
+        intensity = np.asarray(sweep.intensity)[:num_points]
+        return ReadSweep(name, rows[:, :_COLUMNS], intensity, num_points - len(rows))
     return ReadSweep(name, *as_points(sweep, called=called))

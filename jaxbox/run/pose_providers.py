@@ -112,7 +112,7 @@ class RegisteredPoints:
         self._T_world_sensor[index] = T_world_sensor
         if time_s is not None and before is not None:
             xyz = deskew(xyz, time_s, relative_rigid(before, T_world_sensor))
-        return ReadSweep(sweep.name, xyz, intensity)
+        return ReadSweep(sweep.name, xyz, intensity, getattr(sweep, "num_dropped", 0))
 
     def locate(self, index: int, detections: Detections) -> np.ndarray:
         """The pose that was found, which is then forgotten."""
@@ -179,6 +179,11 @@ class Deskewed:
     def name(self) -> str:
         """Of the sweep."""
         return self.sweep.name
+
+    @property
+    def num_dropped(self) -> int:
+        """As the sweep's."""
+        return getattr(self.sweep, "num_dropped", 0)
 
     def read_points(self) -> tuple[np.ndarray, np.ndarray | None]:
         """Reads the points and moves them."""
