@@ -54,7 +54,7 @@ class TrackStatus(enum.IntFlag):
 
 _STATUS_TEXT = {
     TrackStatus.TRACK_OVERFLOW: "more vehicles than slots; those with the lowest scores began no track. "
-    "Start with more: TrackerState.empty(max_tracks).",
+    "Ask for more: jaxbox.track(max_tracks=...), on the command line --max-tracks.",
     TrackStatus.TIME_NOT_LATER: "the sweep is not later than the one before, or has no time; it was passed "
     "over and the tracks are as they were. Sort the sweeps by time and drop doubled ones.",
     TrackStatus.TIME_GAP: "more than TrackConfig.max_gap_s passed since the sweep before; all tracks ended, "
