@@ -63,7 +63,8 @@ _STATUS_TEXT = {
     "stand. Check the source of the poses.",
     TrackStatus.POSE_JUMP: "the pose moved faster than TrackConfig.max_ego_speed_mps; all tracks ended, "
     "and new ones began. Check the source of the poses.",
-    TrackStatus.INVALID_DETECTIONS: "detections with NaN or infinite numbers were ignored.",
+    TrackStatus.INVALID_DETECTIONS: "detections with numbers that are NaN, infinite or beyond a million were "
+    "ignored.",
     TrackStatus.POSE_FROM_BOXES: "no poses were given, so they were estimated from the boxes, to some "
     "centimetres a sweep; velocities are as good as that.",
     TrackStatus.POSE_UNKNOWN: "no poses were given or found, so the ego vehicle was taken to stand: "
@@ -88,7 +89,7 @@ class TrackCounts:
     low_scores: jax.Array
     """() int32: detections without a track whose score is too low to begin one."""
     invalid: jax.Array
-    """() int32: detections with NaN or infinite numbers."""
+    """() int32: detections with numbers that are NaN, infinite or beyond a million."""
     deaths: jax.Array
     """() int32: tracks that ended."""
     tracks: jax.Array
