@@ -16,7 +16,7 @@ from jaxbox.types import PointCloud
 
 _COLUMNS = 3
 """x, y, z; a fourth is the intensity."""
-_MAX_COLUMNS = 16
+MAX_COLUMNS = 16
 """An array of more columns has a row for x, one for y and one for z instead: no source has as many fields."""
 
 
@@ -109,7 +109,7 @@ def as_points(points: Any, *, called: str) -> tuple[np.ndarray, np.ndarray | Non
     if array.dtype.kind not in "fiu":
         kind = f"{type(points).__qualname__} of {type(points).__module__}"
         raise TypeError(f"{called} takes an array (n, 3) of real numbers or a PointCloud; this is {kind}.")
-    if array.ndim != 2 or not _COLUMNS <= array.shape[1] <= _MAX_COLUMNS:
+    if array.ndim != 2 or not _COLUMNS <= array.shape[1] <= MAX_COLUMNS:
         fix = _fix_of(array)
         raise ValueError(f"the points have shape {array.shape}; it must be (n, 3) or more columns{fix}.")
     intensity = array[:, _COLUMNS] if array.shape[1] > _COLUMNS else None
@@ -120,7 +120,7 @@ def _fix_of(array: np.ndarray) -> str:
     """What to do about a wrong shape."""
     if array.ndim == 3:
         return ": one sweep at a time, or jaxbox.detect_batch(sweeps), jaxbox.stream(sweeps)"
-    if array.ndim == 2 and array.shape[1] > _MAX_COLUMNS:
+    if array.ndim == 2 and array.shape[1] > MAX_COLUMNS:
         return ": transpose it, points.T"
     if array.ndim == 1:
         return ": a file of float32 is np.fromfile(path, np.float32).reshape(-1, 4)"
