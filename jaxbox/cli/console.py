@@ -119,8 +119,8 @@ def input_errors() -> Iterator[None]:
         if not (isinstance(error, MemoryError) or str(error).startswith("RESOURCE_EXHAUSTED")):
             raise
         print_error(
-            f"there is not enough memory ({str(error) or 'none is left'}). Take a smaller --capacity, smaller "
-            "capacities in the settings, or fewer --jobs; on a GPU see what else runs there."
+            f"there is not enough memory ({str(error) or 'none is left'}). Take a smaller --capacity, "
+            "smaller capacities in the settings, or fewer --jobs; on a GPU see what else runs there."
         )
         raise typer.Exit(ExitCode.BAD_INPUT) from error
 
