@@ -82,6 +82,10 @@ def evaluate(
     _check_options(tracking=tracking, frames=frames, plots=plots, drives=drives, pictures=pictures)
     if not tracking and min_score is not None and not 0 <= min_score <= 1:
         raise typer.BadParameter(f"--min-score is {min_score:g}; scores of detections are from 0 to 1.")
+    if not tracking and protocol is None and min_score is not None and not pictures:
+        raise typer.BadParameter(
+            "--min-score chooses what --pictures draws, and the figures take all scores; give both, or none."
+        )
     of_detecting = {"--preset": preset, "--config": settings, "--set": changes, "--jobs": jobs}
     of_results = {"--tracking": tracking, "--plots": plots, "--drives": drives, "--pictures": pictures}
     of_results |= {"--json": json, "--missing-as-empty": missing_as_empty, "--min-score": min_score}

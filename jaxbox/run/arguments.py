@@ -79,25 +79,27 @@ def _key_of(seed: int) -> jax.Array:
         return jax.random.key(seed)
 
 
-def as_points(points: Any, *, called: str) -> tuple[np.ndarray, np.ndarray | None]:
+def as_points(points: Any, *, called: str, takes_clouds: bool = True) -> tuple[np.ndarray, np.ndarray | None]:
     """The points of one sweep in an array.
 
     Args:
       points: (n, 3) or more columns, real numbers: x, y, z in m, sensor frame, and where there are more the
         intensity; whatever NumPy can make an array of. Masked numbers are NaN, masked intensities 0.
       called: the function that was given them, for the message.
+      takes_clouds: whether that function takes a `PointCloud`, too, and so can be compiled.
 
     Returns:
       xyz (n, 3), and intensity (n,) or None.
 
     Raises:
-      TypeError: for anything but an array, and for one that is being traced.
+      TypeError: for anything but an array, so for a cloud, and for an array that is being traced.
       ValueError: for another shape.
     """
     if isinstance(points, jax.core.Tracer):
+        cloud = ": hand over a PointCloud there, from PointCloud.from_numpy and jaxbox.stack_clouds"
         raise TypeError(
-            f"{called} pads arrays on the host, and so takes none inside jax.jit or jax.vmap: hand over a "
-            "PointCloud there, from PointCloud.from_numpy and jaxbox.stack_clouds."
+            f"{called} pads arrays on the host, and so takes none inside jax.jit or jax.vmap"
+            f"{cloud if takes_clouds else ''}."
         )
     if isinstance(points, str | bytes) or hasattr(points, "__fspath__"):
         raise TypeError(
@@ -105,10 +107,15 @@ def as_points(points: Any, *, called: str) -> tuple[np.ndarray, np.ndarray | Non
         )
     if hasattr(points, "read_points"):
         raise TypeError(f"{called} takes points: read the sweep's, xyz, intensity = sweep.read_points().")
+    if isinstance(points, PointCloud):
+        raise TypeError(
+            f"{called} takes an array and no PointCloud: cloud.xyz1[: int(cloud.num_points), :3]."
+        )
     array = points if isinstance(points, np.ma.MaskedArray) else np.asarray(points)
     if array.dtype.kind not in "fiu":
         kind = f"{type(points).__qualname__} of {type(points).__module__}"
-        raise TypeError(f"{called} takes an array (n, 3) of real numbers or a PointCloud; this is {kind}.")
+        cloud = " or a PointCloud" if takes_clouds else ""
+        raise TypeError(f"{called} takes an array (n, 3) of real numbers{cloud}; this is {kind}.")
     if array.ndim != 2 or not _COLUMNS <= array.shape[1] <= MAX_COLUMNS:
         fix = _fix_of(array)
         raise ValueError(f"the points have shape {array.shape}; it must be (n, 3) or more columns{fix}.")
