@@ -294,6 +294,16 @@ class RunAccount:
             io.write_config(self.output / CONFIG_NAME, self.config)
 
 
+def chosen_by_run(folder: pathlib.Path) -> list[str]:
+    """By what the run that wrote a folder chose among the boxes; empty where nothing says that it did."""
+    try:
+        options = recorded_options((folder / RUN_NAME).read_bytes())
+    except (OSError, ValueError):
+        return []
+    names = "min_score", "min_scores", "classes", "within"
+    return [f"{name} {options[name]}" for name in names if options.get(name)]
+
+
 def _mounting_record(mounting: Mounting) -> dict[str, Any]:
     """The exact numbers, and the transform for whoever reads the boxes."""
     T_level_points = mounting.T_level_points.round(_TRANSFORM_DECIMALS).tolist()

@@ -249,7 +249,8 @@ def segment_packed(cloud: PointCloud, packed: PackedConfig, key: jax.Array) -> S
     """The first half of `detect`, of a configuration that was checked and packed.
 
     Where a sweep is read once, ``decide_packed(cloud, segment_packed(cloud, packed, key), packed)`` is
-    `detect`, bit for bit, and takes a twentieth longer. But each half can be compiled while the other is traced.
+    `detect`, bit for bit, and takes a twentieth longer. But each half can be compiled while the other is
+    traced.
 
     Args:
       cloud: as `detect` takes it.
