@@ -3,6 +3,9 @@
 # First: to import JAX takes a second, in which Ctrl-C is to be heard, too.
 from jaxbox._interrupts import release as _release  # isort: split
 
+import importlib as _importlib
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+
 from jaxbox._box import Box, Detection
 from jaxbox._version import __version__
 from jaxbox.config import DEFAULT_SCORE_THRESHOLD, DetectorConfig, TrackConfig, propose_capacities
@@ -63,5 +66,25 @@ __all__ = [
     "summarise",
     "track",
 ]
+
+if _TYPE_CHECKING:
+    from jaxbox import cluster as cluster
+    from jaxbox import evaluation as evaluation
+    from jaxbox import io as io
+    from jaxbox import live as live
+    from jaxbox import reference as reference
+    from jaxbox import synthetic as synthetic
+    from jaxbox import tuning as tuning
+    from jaxbox import viewer as viewer
+    from jaxbox import viz as viz
+else:
+    _LATER = {"cluster", "evaluation", "io", "live", "reference", "synthetic", "tuning", "viewer", "viz"}
+
+    def __getattr__(name):
+        """Packages that detecting does not need are imported when they are asked for, as ``jaxbox.io``."""
+        if name not in _LATER:
+            raise AttributeError(f"module 'jaxbox' has no attribute {name!r}")
+        return _importlib.import_module(f".{name}", __name__)
+
 
 _release()

@@ -107,7 +107,7 @@ class BoxRows(ByValue, Generic[AnyBox]):
           Those boxes.
 
         Raises:
-          ValueError: for an unknown class, naming the known ones; for two names of one class.
+          ValueError: for an unknown class, naming the known ones; for two names of one class; for NaN.
         """
         host = _one_sweep(self)
         return self[reaches(host.score, host.label, score)]
@@ -138,7 +138,7 @@ class BoxRows(ByValue, Generic[AnyBox]):
           Those boxes.
 
         Raises:
-          ValueError: for a polygon of another shape.
+          ValueError: for a polygon of another shape, or with a corner that is NaN or infinite.
         """
         center = np.asarray(_one_sweep(self).center, np.float64)
         if isinstance(area, RegionConfig):
@@ -322,9 +322,11 @@ def reaches(score: Any, label: Any, least: float | ScoreByClass) -> np.ndarray:
       (n,) bool.
 
     Raises:
-      ValueError: for an unknown class, or two names of one class.
+      ValueError: for an unknown class, two names of one class, or NaN.
     """
     score = np.asarray(score)
+    if any(map(np.isnan, least.values() if isinstance(least, Mapping) else [least])):
+        raise ValueError(f"the score is {least}, which no box reaches; give a number from 0 to 1.")
     if not isinstance(least, Mapping):
         return score >= least
     known: dict[Label, float] = {}
@@ -347,7 +349,7 @@ def in_polygon(center: np.ndarray, polygon: Any) -> np.ndarray:
       (k,) bool.
 
     Raises:
-      ValueError: for a polygon of another shape.
+      ValueError: for a polygon of another shape, or with a corner that is NaN or infinite.
     """
     corners = np.asarray(polygon, np.float64)
     if corners.ndim != 2 or corners.shape[0] < MIN_CORNERS or corners.shape[1] < 2:
@@ -355,6 +357,8 @@ def in_polygon(center: np.ndarray, polygon: Any) -> np.ndarray:
             f"the polygon has shape {corners.shape}; it must be (m, 2), three corners or more, in metres; "
             "a rectangle round the sensor is a jaxbox.config.RegionConfig."
         )
+    if not np.isfinite(corners[:, :2]).all():
+        raise ValueError("a corner of the polygon is NaN or infinite; give finite numbers, in metres.")
     x, y = center[:, None, 0], center[:, None, 1]
     x0, y0 = corners[:, 0], corners[:, 1]
     x1, y1 = np.roll(x0, -1), np.roll(y0, -1)

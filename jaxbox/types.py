@@ -73,7 +73,8 @@ _STATUS_TEXT = {
     Status.EMPTY: "no finite point lies within the region; there is nothing to detect.",
     Status.NONFINITE_POINTS: "points with NaN or infinite coordinates were ignored.",
     Status.POINT_OVERFLOW: "the sweep has more points than the cloud's capacity; the farthest "
-    "were dropped. Use PointCloud.from_numpy(..., capacity=...) with a larger capacity.",
+    "were dropped. Use PointCloud.from_numpy(..., capacity=...), on the command line --capacity, with a "
+    "larger capacity.",
     Status.NO_GROUND: "no plane had enough support; heights are taken from the lowest candidate instead.",
     Status.GROUND_ABOVE: "the ground lies above the origin, so that vehicles hang from it and are not found. "
     "The sensor is mounted upside down, z points down, or the points are not in the sensor's frame; turn or "

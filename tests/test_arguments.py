@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxbox
-from jaxbox import DetectorConfig, PointCloud, synthetic
+from jaxbox import DetectorConfig, PointCloud, Status, synthetic
 from jaxbox.run.arguments import as_config, as_key, as_sweeps
 from jaxbox.run.compiled import count_compilations
 
@@ -39,6 +39,18 @@ def test_an_array_has_the_answer_of_its_cloud(sweep, xyz, found):
         assert detections == found
         assert isinstance(detections.score, np.ndarray)
     assert len(found) > 0
+
+
+def test_masked_points_of_an_array_are_ignored_as_nan_is(sweep, xyz):
+    points = np.ma.masked_array(np.column_stack([xyz, sweep.intensity]), mask=False)
+    points[::3] = np.ma.masked
+    missing = xyz.copy()
+    missing[::3] = np.nan
+    found = jaxbox.detect(points)
+    assert found == jaxbox.detect(missing)
+    assert found.counts.nonfinite_points == len(points[::3])
+    (streamed,) = jaxbox.stream([points], devices=jax.devices()[:1])
+    assert streamed.detections[:] == found
 
 
 def test_arrays_of_other_lengths_and_other_seeds_compile_nothing(xyz, found):
@@ -121,6 +133,18 @@ def test_batches_and_streams_of_arrays_are_those_of_clouds(xyz, found):
         assert [result.detections for result in results] == alone[: len(results)]
         assert results[0].num_points == len(xyz)
     assert found == alone[0][:]
+
+
+@pytest.mark.parametrize("poses", ["none", np.eye(4)[None].repeat(2, axis=0)])
+def test_what_a_cloud_had_no_room_for_is_counted_in_streams_too(xyz, poses):
+    num_kept = 1000
+    cloud = PointCloud.from_numpy(xyz, capacity=num_kept)
+    options = {"devices": jax.devices()[:1]}
+    (streamed,), (tracked,) = jaxbox.stream([cloud], **options), jaxbox.track([cloud], poses=poses, **options)
+    for result in (streamed, tracked):
+        assert result.num_points == result.detections.counts.num_points == len(xyz)
+        assert result.detections.counts.dropped_points == len(xyz) - num_kept
+        assert Status.POINT_OVERFLOW in Status(int(result.detections.status))
 
 
 def test_what_streams_yield_says_what_it_is_in_a_few_lines(xyz):

@@ -288,6 +288,18 @@ def test_eval_of_a_protocol_refuses_what_it_cannot_use(kitti_folder, tmp_path):
         assert not (tmp_path / "out").exists()
 
 
+def test_eval_warns_where_the_run_left_boxes_out(kitti_folder, detected, tmp_path):
+    arguments = ("eval", "--labels", kitti_folder, "--plots", tmp_path / "plots")
+    assert "warning" not in run(*arguments, "--results", detected[0]).stderr
+    filtered = shutil.copytree(detected[0], tmp_path / "filtered")
+    account = json.loads((filtered / "run.json").read_text())
+    account["options"] |= {"min_score": 0.3, "classes": ["van"]}
+    (filtered / "run.json").write_text(json.dumps(account))
+    result = run(*arguments, "--results", filtered)
+    assert result.exit_code == 0
+    assert "the run left boxes out (min_score 0.3; classes ['van'])" in result.stderr
+
+
 def test_eval_with_drives_has_a_row_a_drive(kitti_folder, detected, tmp_path):
     drives = tmp_path / "drives.txt"
     drives.write_text("000000 first_street\n000001 second_street\n")

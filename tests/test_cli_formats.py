@@ -6,6 +6,7 @@ import errno
 import json
 import os
 import pathlib
+import shutil
 import signal
 
 import numpy as np
@@ -160,6 +161,12 @@ def test_resume_with_other_settings_or_a_file_that_cannot_be_continued_is_refuse
     result = detect(tmp_path, *common, "--resume", "--format", "rerun")
     assert result.exit_code == 2
     assert "detections.rrd cannot be continued" in result.stderr
+    other = tmp_path / "other"
+    other.mkdir()
+    shutil.copy(sweeps / "a.bin", other / "c.bin")
+    result = detect(tmp_path, other / "c.bin", *common[1:], "--resume")
+    assert result.exit_code == 2, "another drive's sweep of the same name is not done"
+    assert f"run.json: the earlier run was of {sweeps / 'c.bin'}" in result.stderr
     for spoil in (lambda path: path.write_text('{"options": 1}'), pathlib.Path.unlink):
         spoil(tmp_path / "run.json")
         result = detect(tmp_path, *common, "--resume")

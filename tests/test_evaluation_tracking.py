@@ -626,7 +626,12 @@ def test_options_that_cannot_be_used_end_with_exit_code_2(folder, options, messa
 
 
 @pytest.mark.parametrize(
-    ("options", "message"), [(("--frames", "0000"), "--tracking"), (("--min-score", "1.5"), "from 0 to 1")]
+    ("options", "message"),
+    [
+        (("--frames", "0000"), "--tracking"),
+        (("--min-score", "1.5"), "from 0 to 1"),
+        (("--min-score", "0.5"), "chooses what --pictures draws"),
+    ],
 )
 def test_options_of_tracks_are_refused_for_single_sweeps(tmp_path, options, message):
     result = run("eval", "--labels", tmp_path, "--results", tmp_path, *options)

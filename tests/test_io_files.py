@@ -70,6 +70,8 @@ def test_text_points_without_intensity_have_zeros_and_may_be_nan(tmp_path):
         ("1 2 3\n1 2\n", r"a\.txt, line 2: 2 columns"),
         ("1 2 3 4\n1 2 3\n", r"a\.txt, line 2: 3 columns"),
         ("1 2\n", r"a\.txt, line 1: 2 columns"),
+        (",x,y,z\n0,1.5,-2,0.25\n", r"a\.txt, line 2: 4 columns, and the first line names 3"),
+        ("x,y,z\n1,5,-2,0,0,25\n", r"a\.txt, line 2: 6 columns, and the first line names 3"),
         (LINE, r"a\.txt, line 1: 'Car 0\.00 0 .*is not x y z"),
     ],
 )

@@ -291,6 +291,7 @@ def test_numpy_files_that_claim_too_much_or_hold_other_things_are_refused(tmp_pa
     with (tmp_path / "huge.npy").open("wb") as file:
         np.lib.format.write_array_header_1_0(file, header)
     np.save(tmp_path / "flat.npy", np.zeros(9))
+    np.save(tmp_path / "transposed.npy", np.zeros((3, 17)))
     np.save(tmp_path / "objects.npy", np.array([{}], object), allow_pickle=True)
     np.save(tmp_path / "empty.npy", np.zeros((0, 4)))
     np.savez(tmp_path / "many.npz", a=XYZ, b=XYZ)
@@ -298,6 +299,8 @@ def test_numpy_files_that_claim_too_much_or_hold_other_things_are_refused(tmp_pa
         io.read_points(tmp_path / "huge.npy")
     with pytest.raises(io.InputError, match=r"flat\.npy: the array is float64 of shape \(9,\)"):
         io.read_points(tmp_path / "flat.npy")
+    with pytest.raises(io.InputError, match=r"transposed\.npy: the array has shape \(3, 17\).*points\.T"):
+        io.read_points(tmp_path / "transposed.npy")
     with pytest.raises(io.InputError, match=r"objects\.npy: no readable"):
         io.read_points(tmp_path / "objects.npy")
     with pytest.raises(io.InputError, match=r"many\.npz: holds a, b; name the points one of points, xyz"):

@@ -30,7 +30,8 @@ start = time.process_time()
 import jaxbox
 seconds = time.process_time() - start
 loaded = {name.partition(".")[0] for name in set(sys.modules) - before}
-print(json.dumps({"seconds": seconds, "loaded": sorted(loaded), "file": jaxbox.__file__}))
+later = [jaxbox.io.read_points.__name__, jaxbox.synthetic.make_sweep.__name__, hasattr(jaxbox, "images")]
+print(json.dumps({"seconds": seconds, "loaded": sorted(loaded), "file": jaxbox.__file__, "later": later}))
 """
 
 
@@ -43,6 +44,10 @@ def imported():
 def test_the_import_loads_nothing_heavy(imported):
     assert "jaxbox" in imported["loaded"]
     assert not HEAVY & set(imported["loaded"])
+
+
+def test_what_messages_and_pages_name_is_there_after_the_import_alone(imported):
+    assert imported["later"] == ["read_points", "make_sweep", False]
 
 
 def test_the_import_takes_less_than_a_second_beyond_jax(imported):

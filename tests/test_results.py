@@ -146,6 +146,9 @@ def test_filters_keep_what_they_say(found):
     for names in (("car", "cars"), (Label.CAR, "Car")):
         with pytest.raises(ValueError, match=f"{names[1]!r} is 'car' again: give one score a class"):
             found.above(dict.fromkeys(names, 0.5))
+    for nothing in (np.nan, {"car": np.nan}):
+        with pytest.raises(ValueError, match="no box reaches"):
+            found.above(nothing)
 
 
 def test_a_filter_keeps_rows_and_leaves_the_points_of_other_boxes_to_none(found):
@@ -174,6 +177,9 @@ def test_boxes_within_a_region_or_a_polygon_are_those_whose_centres_are(found):
     for wrong in (rectangle[:2], rectangle[:, 0]):
         with pytest.raises(ValueError, match="three corners"):
             found.within(wrong)
+    for nowhere in (np.nan, np.inf):
+        with pytest.raises(ValueError, match="NaN or infinite"):
+            found.within([*rectangle, [nowhere, 0]])
 
 
 def test_equal_is_what_has_the_same_values(found):

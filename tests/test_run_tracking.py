@@ -279,6 +279,20 @@ def test_sweeps_that_were_read_ahead_go_to_other_processes(drive):
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(prepared)).xyz, drive[0].xyz)
 
 
+def test_a_sweep_whose_times_cannot_be_read_is_not_read_without_them():
+    pytest.importorskip("kiss_icp")
+    provider = RegisteredPoints()
+
+    class Untimed(TimedSweep):
+        def read_timed_points(self):
+            raise ValueError("which unit?")
+
+    broken = provider.prepare(0, Untimed())
+    with pytest.raises(ValueError, match="which unit"):
+        broken.read_points()
+    assert np.isnan(provider.locate(0, None)).all(), "no pose"
+
+
 def test_trails_end_where_the_track_is_and_begin_two_seconds_ago(drive):
     tracked = list(jaxbox.track(drive, poses=poses_along_x(NUM_SWEEPS)))
     trails = Trails(duration_s=0.35)

@@ -147,8 +147,12 @@ def test_what_cannot_be_used_is_refused_with_what_to_do(xyz, cluster, monkeypatc
             call(xyz[:, :2])
         with pytest.raises(ValueError, match="is not a preset"):
             call(xyz, config="papr")
-        with pytest.raises(TypeError, match="PointCloud there"):
+        with pytest.raises(TypeError, match=r"takes none inside jax\.jit or jax\.vmap\.\n"):
             jax.jit(call)(xyz)
+        with pytest.raises(TypeError, match=r"an array and no PointCloud: cloud\.xyz1\["):
+            call(jaxbox.PointCloud.from_numpy(xyz))
+        with pytest.raises(TypeError, match="real numbers; this is NoneType"):
+            call(None)
     with pytest.raises(ValueError, match="1048576 points at most"):
         jaxbox.remove_ground(np.zeros((2**20 + 1, 3), np.float32))
     for wrong in (cluster[1:], cluster.astype(float)):

@@ -3,6 +3,7 @@
 import io
 
 import pytest
+import typer
 from rich.console import Console
 from test_cli import make_small_sweep, run, write_points
 
@@ -56,3 +57,15 @@ def test_a_link_for_the_folder_of_pictures_is_refused_and_nothing_is_written_thr
     assert result.exit_code == 2, result.output
     assert "out/pictures: a link, and pictures are not written through one; remove it" in result.stderr
     assert [path.name for path in elsewhere.iterdir()] == [".jaxbox-keep"]
+
+
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 2576123 bytes.")]
+)
+def test_a_lack_of_memory_is_one_line_and_other_errors_of_jax_stay_errors(error, capsys):
+    with pytest.raises(typer.Exit) as end, console.input_errors():
+        raise error
+    assert end.value.exit_code == console.ExitCode.BAD_INPUT
+    assert capsys.readouterr().err.startswith("error: there is not enough memory (")
+    with pytest.raises(RuntimeError, match="INTERNAL"), console.input_errors():
+        raise RuntimeError("INTERNAL: no memory is short")

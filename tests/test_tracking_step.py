@@ -516,7 +516,7 @@ def test_several_bits_are_set_together():
 
 
 @pytest.mark.parametrize("field", ["center", "size", "yaw", "score", "extent"])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e30])
 def test_detections_that_are_no_numbers_are_counted_and_left_out(field, value):
     state, _ = after_two()
     expected_state, expected = step(state, cars(PLACES), 0.1, STAY)

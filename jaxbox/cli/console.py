@@ -107,12 +107,21 @@ def input_errors() -> Iterator[None]:
     """Turns errors that the user can fix into one line on stderr and exit code 2.
 
     Raises:
-      typer.Exit: in place of a bad input, an unwritable folder or a missing extra.
+      typer.Exit: in place of a bad input, an unwritable folder, a missing extra or a lack of memory.
     """
     try:
         yield
     except (InputError, OutputError, OSError, ImportError) as error:
         print_error(str(error))
+        raise typer.Exit(ExitCode.BAD_INPUT) from error
+    except (MemoryError, RuntimeError) as error:
+        # JAX's errors are all of one class.
+        if not (isinstance(error, MemoryError) or str(error).startswith("RESOURCE_EXHAUSTED")):
+            raise
+        print_error(
+            f"there is not enough memory ({str(error) or 'none is left'}). Take a smaller --capacity, "
+            "smaller capacities in the settings, or fewer --jobs; on a GPU see what else runs there."
+        )
         raise typer.Exit(ExitCode.BAD_INPUT) from error
 
 

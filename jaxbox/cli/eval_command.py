@@ -7,12 +7,13 @@ from typing import Annotated
 import typer
 
 from jaxbox.cli.config_options import chosen_config
-from jaxbox.cli.console import input_errors, stdout
+from jaxbox.cli.console import input_errors, print_warning, stdout
 from jaxbox.cli.eval_protocol import ProtocolOptions, run_eval_protocol
 from jaxbox.cli.evaluate import run_eval
 from jaxbox.cli.evaluate_tracking import run_eval_tracking
 from jaxbox.cli.options import DrivesOption, PresetOption, SetOption, SettingsOption
 from jaxbox.cli.report import SHOWN_MIN_SCORE
+from jaxbox.cli.results import RUN_NAME, chosen_by_run
 from jaxbox.evaluation.protocols import Protocol
 
 
@@ -82,6 +83,10 @@ def evaluate(
     _check_options(tracking=tracking, frames=frames, plots=plots, drives=drives, pictures=pictures)
     if not tracking and min_score is not None and not 0 <= min_score <= 1:
         raise typer.BadParameter(f"--min-score is {min_score:g}; scores of detections are from 0 to 1.")
+    if not tracking and protocol is None and min_score is not None and not pictures:
+        raise typer.BadParameter(
+            "--min-score chooses what --pictures draws, and the figures take all scores; give both, or none."
+        )
     of_detecting = {"--preset": preset, "--config": settings, "--set": changes, "--jobs": jobs}
     of_results = {"--tracking": tracking, "--plots": plots, "--drives": drives, "--pictures": pictures}
     of_results |= {"--json": json, "--missing-as-empty": missing_as_empty, "--min-score": min_score}
@@ -94,6 +99,11 @@ def evaluate(
             config = chosen_config(preset, settings, changes or [])
             options = ProtocolOptions(protocol=protocol, config=config, jobs=jobs or 1)
             raise typer.Exit(run_eval_protocol(labels, results, options, stdout()))
+        if chosen := chosen_by_run(results):
+            print_warning(
+                f"{results}: by {RUN_NAME} the run left boxes out ({'; '.join(chosen)}), and the figures are "
+                "of those that it kept."
+            )
         if tracking:
             run_eval_tracking(
                 labels,

@@ -5,6 +5,7 @@ import dataclasses
 import datetime
 import enum
 import json
+import os
 import pathlib
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -199,7 +200,7 @@ class RunAccount:
     """How the sensor stands; None where the sweeps are taken as they are."""
 
     def check_resumable(self) -> None:
-        """Refuses to go on with other settings than those of the results that are there.
+        """Refuses to go on with other settings or sweeps than those of the results that are there.
 
         Raises:
           InputError: naming what differs, or what is missing to tell.
@@ -208,7 +209,8 @@ class RunAccount:
             return
         earlier = io.read_config(self.output / CONFIG_NAME, base=self.config)
         try:
-            recorded = recorded_options((self.output / RUN_NAME).read_bytes())
+            account = (self.output / RUN_NAME).read_bytes()
+            recorded = recorded_options(account)
         except (OSError, ValueError) as error:
             raise io.InputError(
                 f"{self.output / RUN_NAME}: --resume needs the options of the earlier run "
@@ -220,6 +222,19 @@ class RunAccount:
                 f"{self.output / CONFIG_NAME}: --resume needs the settings of the earlier run, and "
                 f"{', '.join(differing)} differ. Give that file with --config, and the options in "
                 f"{RUN_NAME}, or another --output."
+            )
+        self._check_inputs(json.loads(account).get("inputs"))
+
+    def _check_inputs(self, earlier: Any) -> None:
+        """Refuses to leave out a path of the earlier run: another drive has sweeps of the same names."""
+        given = {os.path.abspath(path) for path in self.inputs}
+        paths = map(str, earlier if isinstance(earlier, list) else [])
+        missing = [path for path in paths if os.path.abspath(path) not in given]
+        if missing:
+            raise io.InputError(
+                f"{self.output / RUN_NAME}: the earlier run was of {', '.join(missing)}, too, and --resume "
+                "knows sweeps by their names alone. Give the paths of that run, and any more, or another "
+                "--output."
             )
 
     def earlier_mounting(self) -> Mounting | None:
@@ -277,6 +292,16 @@ class RunAccount:
             with io.atomic_writer(self.output / RUN_NAME) as handle:
                 handle.write(json.dumps(account, indent=2) + "\n")
             io.write_config(self.output / CONFIG_NAME, self.config)
+
+
+def chosen_by_run(folder: pathlib.Path) -> list[str]:
+    """By what the run that wrote a folder chose among the boxes; empty where nothing says that it did."""
+    try:
+        options = recorded_options((folder / RUN_NAME).read_bytes())
+    except (OSError, ValueError):
+        return []
+    names = "min_score", "min_scores", "classes", "within"
+    return [f"{name} {options[name]}" for name in names if options.get(name)]
 
 
 def _mounting_record(mounting: Mounting) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from jaxbox.io.points import (
     check_unpacked,
     named_points,
 )
+from jaxbox.run.arguments import MAX_COLUMNS
 
 ARRAY_NAMES = ("points", "xyz", "pointcloud", "data", "arr_0")
 """Arrays that are looked for in a .npz file of several, in this order; its only one needs no name."""
@@ -157,6 +158,11 @@ def _array_columns(points: np.ndarray, where: str) -> dict[str, np.ndarray]:
         raise InputError(
             f"{where}: the array is {points.dtype} of shape {points.shape}; points are (n, 3 or more) real "
             "numbers: x, y, z, intensity."
+        )
+    if points.shape[1] > MAX_COLUMNS:
+        raise InputError(
+            f"{where}: the array has shape {points.shape}, and points are rows of x, y, z, intensity: save "
+            "it transposed, points.T."
         )
     return dict(zip(_COLUMNS, points.T, strict=False))
 

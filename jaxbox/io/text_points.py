@@ -1,6 +1,7 @@
 """Points as text, one a line."""
 
 import array
+import math
 import os
 
 import numpy as np
@@ -26,8 +27,8 @@ def read_text_points(path: str | os.PathLike[str]) -> Points:
       intensity: (n,) float32; 0 where there is no fourth column.
 
     Raises:
-      InputError: naming file and line, for a line that is not numbers, or has fewer than three columns
-        or another number than the first.
+      InputError: naming file and line, for a line that is not numbers, or has fewer than three columns,
+        another number than the first, or more than a first line of names.
     """
     points, _ = _read_rows(path)
     return points[:, :3], points[:, 3]
@@ -52,17 +53,22 @@ def read_timed_text_points(path: str | os.PathLike[str]) -> TimedPoints:
 
 def _read_rows(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray | None]:
     """x, y, z and intensity (n, 4) float32, and the column of times, if any."""
-    columns, values = 0, array.array("d")
+    columns, num_named, values = 0, math.inf, array.array("d")
     time_column, times = None, array.array("d")
     for number, line in enumerate(read_text(path).replace(",", " ").splitlines(), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
         if not columns and _is_header(words):
-            time_column = _time_column(words)
+            time_column, num_named = _time_column(words), len(words)
             continue
         columns = columns or len(words)
         where = f"{path}, line {number}"
+        if columns > num_named:
+            raise InputError(
+                f"{where}: {columns} columns, and the first line names {num_named}. Write no column before "
+                "x, as pandas does without index=False, and no comma within a number."
+            )
         values.extend(_parse_point(words, columns, where))
         if time_column is not None:
             times.append(_parse_time(words, time_column, where))

@@ -27,6 +27,8 @@ RIGID_TOLERANCE = 1e-3
 """Entries of R R^T may differ from those of the identity by this."""
 MAX_TURN_DEG_PER_S = 180.0
 """No vehicle turns faster."""
+MAX_NUMBER = 1e6
+"""A detection with a number beyond is no vehicle near a sensor."""
 FIRST_INTERVAL_S = 0.1
 """What is taken for the time before the first sweep."""
 Z_GAIN, FIRST_Z_GAIN = 0.3, 0.5
@@ -63,7 +65,7 @@ def track_step(
         to_current_frame(track, interval)
         predict(track, interval.dt, config)
     rows = _in_order_of_score(seen)
-    finite = [row for row in rows if _is_finite(seen, row)]
+    finite = [row for row in rows if _is_plausible(seen, row)]
     pairs = associate(tracker, seen, finite, config)
     for slot, track in tracker.numbered():
         if slot in pairs:
@@ -204,9 +206,11 @@ def _in_order_of_score(seen: Any) -> list[int]:
     return sorted(np.flatnonzero(valid).tolist(), key=lambda row: (math.isnan(score[row]), -score[row]))
 
 
-def _is_finite(seen: Any, row: int) -> bool:
+def _is_plausible(seen: Any, row: int) -> bool:
     names = ("center", "size", "extent", "yaw", "score", "front_log_odds")
-    return all(bool(np.isfinite(np.asarray(getattr(seen, name)[row])).all()) for name in names)
+    numbers = np.concatenate([np.ravel(getattr(seen, name)[row]) for name in names])
+    # Anything compared with NaN is False.
+    return bool((np.abs(numbers) <= MAX_NUMBER).all())
 
 
 def associate(tracker: Tracker, seen: Any, rows: list[int], config: TrackConfig) -> dict[int, int]:

@@ -10,12 +10,13 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbox._padding import unmasked
 from jaxbox.config import DetectorConfig
 from jaxbox.types import PointCloud
 
 _COLUMNS = 3
 """x, y, z; a fourth is the intensity."""
-_MAX_COLUMNS = 16
+MAX_COLUMNS = 16
 """An array of more columns has a row for x, one for y and one for z instead: no source has as many fields."""
 
 
@@ -78,25 +79,27 @@ def _key_of(seed: int) -> jax.Array:
         return jax.random.key(seed)
 
 
-def as_points(points: Any, *, called: str) -> tuple[np.ndarray, np.ndarray | None]:
+def as_points(points: Any, *, called: str, takes_clouds: bool = True) -> tuple[np.ndarray, np.ndarray | None]:
     """The points of one sweep in an array.
 
     Args:
       points: (n, 3) or more columns, real numbers: x, y, z in m, sensor frame, and where there are more the
-        intensity; whatever NumPy can make an array of.
+        intensity; whatever NumPy can make an array of. Masked numbers are NaN, masked intensities 0.
       called: the function that was given them, for the message.
+      takes_clouds: whether that function takes a `PointCloud`, too, and so can be compiled.
 
     Returns:
       xyz (n, 3), and intensity (n,) or None.
 
     Raises:
-      TypeError: for anything but an array, and for one that is being traced.
+      TypeError: for anything but an array, so for a cloud, and for an array that is being traced.
       ValueError: for another shape.
     """
     if isinstance(points, jax.core.Tracer):
+        cloud = ": hand over a PointCloud there, from PointCloud.from_numpy and jaxbox.stack_clouds"
         raise TypeError(
-            f"{called} pads arrays on the host, and so takes none inside jax.jit or jax.vmap: hand over a "
-            "PointCloud there, from PointCloud.from_numpy and jaxbox.stack_clouds."
+            f"{called} pads arrays on the host, and so takes none inside jax.jit or jax.vmap"
+            f"{cloud if takes_clouds else ''}."
         )
     if isinstance(points, str | bytes) or hasattr(points, "__fspath__"):
         raise TypeError(
@@ -104,21 +107,27 @@ def as_points(points: Any, *, called: str) -> tuple[np.ndarray, np.ndarray | Non
         )
     if hasattr(points, "read_points"):
         raise TypeError(f"{called} takes points: read the sweep's, xyz, intensity = sweep.read_points().")
-    array = np.asarray(points)
+    if isinstance(points, PointCloud):
+        raise TypeError(
+            f"{called} takes an array and no PointCloud: cloud.xyz1[: int(cloud.num_points), :3]."
+        )
+    array = points if isinstance(points, np.ma.MaskedArray) else np.asarray(points)
     if array.dtype.kind not in "fiu":
         kind = f"{type(points).__qualname__} of {type(points).__module__}"
-        raise TypeError(f"{called} takes an array (n, 3) of real numbers or a PointCloud; this is {kind}.")
-    if array.ndim != 2 or not _COLUMNS <= array.shape[1] <= _MAX_COLUMNS:
+        cloud = " or a PointCloud" if takes_clouds else ""
+        raise TypeError(f"{called} takes an array (n, 3) of real numbers{cloud}; this is {kind}.")
+    if array.ndim != 2 or not _COLUMNS <= array.shape[1] <= MAX_COLUMNS:
         fix = _fix_of(array)
         raise ValueError(f"the points have shape {array.shape}; it must be (n, 3) or more columns{fix}.")
-    return array[:, :_COLUMNS], array[:, _COLUMNS] if array.shape[1] > _COLUMNS else None
+    intensity = array[:, _COLUMNS] if array.shape[1] > _COLUMNS else None
+    return unmasked(array[:, :_COLUMNS], np.nan), unmasked(intensity, 0)
 
 
 def _fix_of(array: np.ndarray) -> str:
     """What to do about a wrong shape."""
     if array.ndim == 3:
         return ": one sweep at a time, or jaxbox.detect_batch(sweeps), jaxbox.stream(sweeps)"
-    if array.ndim == 2 and array.shape[1] > _MAX_COLUMNS:
+    if array.ndim == 2 and array.shape[1] > MAX_COLUMNS:
         return ": transpose it, points.T"
     if array.ndim == 1:
         return ": a file of float32 is np.fromfile(path, np.float32).reshape(-1, 4)"
@@ -154,6 +163,8 @@ class ReadSweep:
     """(n, 3) float32, m, sensor frame."""
     intensity: np.ndarray | None
     """(n,) float32, or None."""
+    num_dropped: int = 0
+    """Points that a cloud had no room for, and that are not among these."""
 
     def read_points(self) -> tuple[np.ndarray, np.ndarray | None]:
         """The points."""
@@ -186,6 +197,8 @@ def _as_sweep(sweep: Any, index: int, called: str) -> Any:
         return sweep
     name = f"{index:06d}"
     if isinstance(sweep, PointCloud):
-        rows = np.asarray(sweep.xyz1)[: int(sweep.num_points)]
-        return ReadSweep(name, rows[:, :_COLUMNS], np.asarray(sweep.intensity)[: len(rows)])
+        num_points = int(sweep.num_points)
+        rows = np.asarray(sweep.xyz1)[:num_points]
+        intensity = np.asarray(sweep.intensity)[:num_points]
+        return ReadSweep(name, rows[:, :_COLUMNS], intensity, num_points - len(rows))
     return ReadSweep(name, *as_points(sweep, called=called))

@@ -249,8 +249,9 @@ _detect_jit = jax.jit(_find_only)
 def segment_packed(cloud: PointCloud, packed: PackedConfig, key: jax.Array) -> Segments:
     """The first half of `detect`, of a configuration that was checked and packed.
 
-    ``decide_packed(cloud, segment_packed(cloud, packed, key), packed)`` is `detect`, bit for bit, and takes a
-    twentieth longer. But each half can be compiled while the other is traced.
+    Where a sweep is read once, ``decide_packed(cloud, segment_packed(cloud, packed, key), packed)`` is
+    `detect`, bit for bit, and takes a twentieth longer. But each half can be compiled while the other is
+    traced.
 
     Args:
       cloud: as `detect` takes it.

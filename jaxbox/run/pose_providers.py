@@ -101,22 +101,22 @@ class RegisteredPoints:
         self._T_world_sensor: dict[int, np.ndarray] = {}
 
     def prepare(self, index: int, sweep: ReadableSweep) -> ReadableSweep:
-        """The sweep with its points, which are read and registered now; a broken one stays as it is."""
+        """The sweep with its points, which are read and registered now; a broken one is read again later."""
         try:
             xyz, intensity, time_s = read_timed(sweep)
             before = self._T_world_sensor.get(index - 1)
             T_world_sensor = self._odometry.register(xyz, time_s)
         except Exception:
-            # Reading it for the detector says why, and the others go on.
-            return sweep
+            # Reading it for the detector, with its times as here, says why, and the others go on.
+            return Deskewed(sweep, np.eye(4))
         self._T_world_sensor[index] = T_world_sensor
         if time_s is not None and before is not None:
             xyz = deskew(xyz, time_s, relative_rigid(before, T_world_sensor))
-        return ReadSweep(sweep.name, xyz, intensity)
+        return ReadSweep(sweep.name, xyz, intensity, getattr(sweep, "num_dropped", 0))
 
     def locate(self, index: int, detections: Detections) -> np.ndarray:
-        """The pose that was found, which is then forgotten."""
-        T_world_sensor = self._T_world_sensor[index]
+        """The pose that was found, which is then forgotten; of NaN where the registration failed."""
+        T_world_sensor = self._T_world_sensor.get(index, np.full((4, 4), np.nan))
         for earlier in [item for item in self._T_world_sensor if item < index]:
             del self._T_world_sensor[earlier]
         return T_world_sensor
@@ -179,6 +179,11 @@ class Deskewed:
     def name(self) -> str:
         """Of the sweep."""
         return self.sweep.name
+
+    @property
+    def num_dropped(self) -> int:
+        """As the sweep's."""
+        return getattr(self.sweep, "num_dropped", 0)
 
     def read_points(self) -> tuple[np.ndarray, np.ndarray | None]:
         """Reads the points and moves them."""

@@ -158,7 +158,7 @@ def fit_boxes(
     Reference: paper, 3.4 and Algorithm III; oracle `jaxbox.reference.rectangles`.
     """
     config = as_config(config)
-    points, _ = as_points(xyz, called="jaxbox.fit_boxes")
+    points, _ = as_points(xyz, called="jaxbox.fit_boxes", takes_clouds=False)
     numbers = (
         cluster_points(points, config, key) if cluster is None else _checked_numbers(cluster, len(points))
     )
@@ -178,7 +178,7 @@ def fit_boxes(
 
 def _operands(xyz: ArrayLike, config: DetectorConfig, called: str) -> tuple[PointCloud, PackedConfig]:
     check_config(config)
-    points, _ = as_points(xyz, called=called)
+    points, _ = as_points(xyz, called=called, takes_clouds=False)
     cloud = PointCloud.from_numpy(points)
     if len(points) > cloud.capacity:
         raise ValueError(f"{called} takes {cloud.capacity} points at most, and these are {len(points)}.")

@@ -121,7 +121,9 @@ class _Buffer:
     def __init__(self) -> None:
         self._rows, self._intensity = aligned_empty((0, 4)), aligned_empty((0,))
 
-    def fill(self, xyz: np.ndarray, intensity: np.ndarray | None, capacity: int | None) -> PointCloud:
+    def fill(
+        self, xyz: np.ndarray, intensity: np.ndarray | None, capacity: int | None, num_dropped: int
+    ) -> PointCloud:
         """A cloud that holds until the buffer is filled again."""
         xyz, intensity = checked_points(xyz, intensity)
         capacity = fitting_capacity(len(xyz)) if capacity is None else capacity
@@ -129,13 +131,13 @@ class _Buffer:
             self._rows, self._intensity = aligned_empty((capacity, 4)), aligned_empty((capacity,))
         fill_rows(xyz, intensity, self._rows, self._intensity)
         # On a CPU JAX computes with the buffer itself: who fills it again has waited for the result.
-        return PointCloud(self._rows, self._intensity, np.array(len(xyz), np.int32))
+        return PointCloud(self._rows, self._intensity, np.array(len(xyz) + num_dropped, np.int32))
 
 
 def _read(sweep: ReadableSweep, buffer: _Buffer, capacity: int | None) -> PointCloud | str:
     """The padded sweep, or why there is none."""
     try:
-        return buffer.fill(*sweep.read_points(), capacity)
+        return buffer.fill(*sweep.read_points(), capacity, getattr(sweep, "num_dropped", 0))
     except Exception as error:
         # Whatever a reader may raise concerns its own sweep alone.
         return f"{type(error).__name__}: {error}"

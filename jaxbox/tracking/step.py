@@ -21,6 +21,8 @@ from jaxbox.tracking.visibility import is_hidden
 from jaxbox.types import combine_bits
 from jaxbox.xla.sequences import scan_sequence
 
+MAX_NUMBER = 1e6
+"""A detection with a number beyond is no vehicle near a sensor; products of four such are finite still."""
 Z_GAIN, FIRST_Z_GAIN = 0.3, 0.5
 """Share of the difference that corrects the height of the centre, and that of the first detections."""
 
@@ -57,7 +59,7 @@ def track_step(
     seen = _take(seen, order)
     slots = _end_all(state.slots, interval.restarts)
     predicted = predict(to_current_frame(slots, interval), interval.dt, config)
-    finite = seen.valid & _is_finite(seen)
+    finite = seen.valid & _is_plausible(seen)
     detection = associate(predicted, seen, finite & (seen.score >= config.low_score), config)
     updated = update(predicted, seen, detection, interval.dt, config)
     kept = forget(updated, seen.first_return_m, config)
@@ -90,7 +92,7 @@ class Fates(NamedTuple):
     low: jax.Array
     """Its score is too low to begin a track."""
     invalid: jax.Array
-    """It has NaN or infinite numbers."""
+    """It has NaN, infinite or enormous numbers."""
 
 
 def _with_rows(seen: Observations) -> Observations:
@@ -107,10 +109,11 @@ def _take(seen: Observations, order: jax.Array) -> Observations:
     return dataclasses.replace(rows, first_return_m=seen.first_return_m)
 
 
-def _is_finite(seen: Observations) -> jax.Array:
+def _is_plausible(seen: Observations) -> jax.Array:
     rows = jnp.stack([seen.yaw, seen.score, seen.front_log_odds], axis=1)
     numbers = [seen.center, seen.size, seen.extent, rows]
-    return jnp.all(jnp.isfinite(jnp.concatenate(numbers, axis=1)), axis=1)
+    # Anything compared with NaN is False.
+    return jnp.all(jnp.abs(jnp.concatenate(numbers, axis=1)) <= MAX_NUMBER, axis=1)
 
 
 def _end_all(slots: Slots, ends: jax.Array) -> Slots:

@@ -54,7 +54,7 @@ class TrackStatus(enum.IntFlag):
 
 _STATUS_TEXT = {
     TrackStatus.TRACK_OVERFLOW: "more vehicles than slots; those with the lowest scores began no track. "
-    "Start with more: TrackerState.empty(max_tracks).",
+    "Ask for more: jaxbox.track(max_tracks=...), on the command line --max-tracks.",
     TrackStatus.TIME_NOT_LATER: "the sweep is not later than the one before, or has no time; it was passed "
     "over and the tracks are as they were. Sort the sweeps by time and drop doubled ones.",
     TrackStatus.TIME_GAP: "more than TrackConfig.max_gap_s passed since the sweep before; all tracks ended, "
@@ -63,7 +63,8 @@ _STATUS_TEXT = {
     "stand. Check the source of the poses.",
     TrackStatus.POSE_JUMP: "the pose moved faster than TrackConfig.max_ego_speed_mps; all tracks ended, "
     "and new ones began. Check the source of the poses.",
-    TrackStatus.INVALID_DETECTIONS: "detections with NaN or infinite numbers were ignored.",
+    TrackStatus.INVALID_DETECTIONS: "detections with numbers that are NaN, infinite or beyond a million were "
+    "ignored.",
     TrackStatus.POSE_FROM_BOXES: "no poses were given, so they were estimated from the boxes, to some "
     "centimetres a sweep; velocities are as good as that.",
     TrackStatus.POSE_UNKNOWN: "no poses were given or found, so the ego vehicle was taken to stand: "
@@ -88,7 +89,7 @@ class TrackCounts:
     low_scores: jax.Array
     """() int32: detections without a track whose score is too low to begin one."""
     invalid: jax.Array
-    """() int32: detections with NaN or infinite numbers."""
+    """() int32: detections with numbers that are NaN, infinite or beyond a million."""
     deaths: jax.Array
     """() int32: tracks that ended."""
     tracks: jax.Array
