@@ -4,6 +4,7 @@ import gc
 import importlib
 import os
 import pathlib
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import hypothesis
@@ -11,6 +12,8 @@ import jax
 import parity
 import pytest
 
+from jaxbox.run import batching, streaming
+from jaxbox.run.batching import checked_devices
 from jaxbox.xla import backend
 
 DATA = pathlib.Path(os.environ.get("JAXBOX_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
@@ -101,6 +104,26 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     # Files in their order: by the number of their tests, the slowest, with few, would all come last.
     config.option.loadscopereorder = False
     return importlib.import_module("xdist.scheduler").LoadFileScheduling(config, log)
+
+
+def _of_first_device(devices: Sequence[Any] | None) -> Sequence[Any]:
+    return checked_devices(jax.local_devices()[:1] if devices is None else devices)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_device() -> Iterator[None]:
+    """Has sweeps for which no devices are named go to the first: each compiles every program once more."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (batching, streaming):
+            patch.setattr(module, "checked_devices", _of_first_device)
+        yield
+
+
+@pytest.fixture
+def _all_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Has them go to all devices, as they do for a user."""
+    for module in (batching, streaming):
+        monkeypatch.setattr(module, "checked_devices", checked_devices)
 
 
 @pytest.fixture(scope="session")

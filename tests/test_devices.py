@@ -1,5 +1,6 @@
 """One decision about what a program is built for, and what the program for accelerators may hold."""
 
+import functools
 import re
 
 import jax
@@ -17,6 +18,7 @@ MAX_LOOPS = 3
 """Loops until nothing changes: hooking of components, counting of neighbours, suppression."""
 
 
+@functools.cache
 def text_for(platform, preset="default"):
     cloud = PointCloud.from_numpy(np.zeros((1, 3), np.float32), capacity=CAPACITY)
     return compiled.lower(cloud, DetectorConfig.presets()[preset], platform=platform).as_text()
