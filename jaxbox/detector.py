@@ -40,6 +40,7 @@ from jaxbox.stages.state import (
     Sweep,
 )
 from jaxbox.types import Detections, PointCloud
+from jaxbox.xla.backend import batch_together
 from jaxbox.xla.barriers import opaque_zeros, outline
 from jaxbox.xla.loops import map_batches
 
@@ -76,7 +77,7 @@ def find_vehicles(cloud: PointCloud, config: DetectorConfig, key: jax.Array) -> 
         return outline(readings.turn_back, read(turned, config, key), angle)
 
     angles = jnp.deg2rad(readings.TURN_DEG * jnp.arange(num_readings, dtype=jnp.float32))
-    found = map_batches(read_turned, angles, chunk=1)
+    found = map_batches(read_turned, angles, chunk=1, together=batch_together())
     return outline(readings.merge_readings, found, config)
 
 

@@ -4,6 +4,7 @@ import gc
 import importlib
 import os
 import pathlib
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import hypothesis
@@ -11,6 +12,8 @@ import jax
 import parity
 import pytest
 
+from jaxbox.run import batching, streaming
+from jaxbox.run.batching import checked_devices
 from jaxbox.xla import backend
 
 DATA = pathlib.Path(os.environ.get("JAXBOX_DATA", pathlib.Path(__file__).parents[2] / "shared" / "data"))
@@ -43,6 +46,8 @@ SLOW = {
     "test_the_rough_look_at_real_sweeps_proposes_enough",
 }
 """Tests and fixtures that compile the whole detector, or go through many real sweeps or large files."""
+FIRST = "test_arguments.py"
+"""A file that compiles the default preset for the smallest capacity, and little else."""
 
 MAX_MAPS = 20_000
 """Memory maps of a process at the end of a file of tests, above which it forgets its compiled programs."""
@@ -74,7 +79,11 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks the fast tests."""
+    """Marks the fast tests, and has them follow the file whose program nearly all others take.
+
+    With `-n 2` one process compiles it while the other goes through the fast tests: else both would.
+    """
+    items.sort(key=lambda item: (item.path.name != FIRST, item.path.name not in FAST))
     for item in items:
         # Doctests have no fixtures.
         names = {getattr(item, "originalname", item.name), *getattr(item, "fixturenames", ())}
@@ -101,6 +110,26 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     # Files in their order: by the number of their tests, the slowest, with few, would all come last.
     config.option.loadscopereorder = False
     return importlib.import_module("xdist.scheduler").LoadFileScheduling(config, log)
+
+
+def _of_first_device(devices: Sequence[Any] | None) -> Sequence[Any]:
+    return checked_devices(jax.local_devices()[:1] if devices is None else devices)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_device() -> Iterator[None]:
+    """Has sweeps for which no devices are named go to the first: each compiles every program once more."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (batching, streaming):
+            patch.setattr(module, "checked_devices", _of_first_device)
+        yield
+
+
+@pytest.fixture
+def _all_devices(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Has them go to all devices, as they do for a user."""
+    for module in (batching, streaming):
+        monkeypatch.setattr(module, "checked_devices", checked_devices)
 
 
 @pytest.fixture(scope="session")

@@ -9,5 +9,10 @@ def count_loops(function, *args, **options):
     A loop whose step does too much for XLA to call it small takes a hundred times as long.
     """
     args = jax.tree.map(lambda a: jax.device_put(a, jax.devices("cpu")[0]), args)
-    text = function.lower(*args, **options).compile().as_text()
+    return loops_of(function.lower(*args, **options))
+
+
+def loops_of(lowered):
+    """As `count_loops`, of a program that was lowered for a CPU."""
+    text = lowered.compile().as_text()
     return text.count(" while("), text.count('xla_cpu_small_call="true"')

@@ -35,18 +35,25 @@ CONFIG = DetectorConfig()
 
 
 @contextlib.contextmanager
-def building_for(*, accelerator):
-    """As `backend.building_for`, for whole detectors: those for accelerators compile without optimisation.
+def compiled_quickly():
+    """Compiles without optimisation, which takes two thirds of the time: the answers are right, not fast.
 
-    Nobody but the tests runs them on a CPU: their answers are to be right, not fast.
+    For static settings that one test alone has: JAX keeps the program for whoever has the same.
     """
     before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", before or accelerator)
+    jax.config.update("jax_disable_most_optimizations", True)
     try:
-        with backend.building_for(accelerator=accelerator):
-            yield
+        yield
     finally:
         jax.config.update("jax_disable_most_optimizations", before)
+
+
+@contextlib.contextmanager
+def building_for(*, accelerator):
+    """As `backend.building_for`, for whole detectors: nobody but the tests runs an accelerator's on a CPU."""
+    quickly = compiled_quickly() if accelerator else contextlib.nullcontext()
+    with quickly, backend.building_for(accelerator=accelerator):
+        yield
 
 
 class PerForm:

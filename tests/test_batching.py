@@ -14,6 +14,8 @@ from jaxbox.config import EvidenceConfig
 from jaxbox.run import batching, compiled, streaming
 
 SEEDS = (0, 1, 2)
+PAPER = DetectorConfig.paper()
+"""The preset that each device and process has soonest."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,8 +66,9 @@ def test_a_batch_takes_a_key_and_settings_for_all():
     assert_same_bits(jax.device_get(detections), run(street(0).xyz, config=config, key=key))
 
 
+@pytest.mark.usefixtures("_all_devices")
 def test_devices_take_turns_and_each_gets_the_cloud_and_the_key(monkeypatch):
-    # What is computed has tests enough, and each device would compile it once more.
+    # Each device would compile once more; the bits are those of the test that follows.
     monkeypatch.setattr(batching, "detect", lambda cloud, config, key: (cloud, config, key))
     clouds, config = [cloud(seed) for seed in SEEDS], DetectorConfig()
     calls = detect_batch(clouds, config, jax.random.key(5))
@@ -74,6 +77,13 @@ def test_devices_take_turns_and_each_gets_the_cloud_and_the_key(monkeypatch):
         assert batching._devices_of(sent.xyz1) == key.devices() == {device}
         assert settings is config
         np.testing.assert_array_equal(sent.xyz1, clouds[number].xyz1)
+
+
+@pytest.mark.usefixtures("_all_devices")
+def test_each_device_has_the_bits_of_the_singles():
+    for seed, detections in zip(SEEDS, detect_batch([cloud(seed) for seed in SEEDS], PAPER), strict=True):
+        assert detections.center.devices() == {jax.local_devices()[seed % 2]}
+        assert_same_bits(jax.device_get(detections), run(street(seed).xyz, config=PAPER))
 
 
 def test_arrays_of_the_host_are_computed_with_on_the_default_device():
@@ -101,6 +111,7 @@ def test_a_stream_has_the_bits_of_the_singles_and_compiles_nothing_more():
     assert compiled.count_compilations() == before
 
 
+@pytest.mark.usefixtures("_all_devices")
 def test_a_stream_takes_the_devices_in_turns_and_keeps_the_order(monkeypatch):
     used = []
 
@@ -155,9 +166,11 @@ def test_a_stream_refuses_what_cannot_work_before_it_starts():
 
 def test_processes_keep_the_order_and_the_bits_and_survive_a_deadly_sweep():
     failures = {1: "deadly", 3: "unreadable"}
-    results = list(jaxbox.stream(recorded(failures), key=jax.random.key(0), capacity=CAPACITY, workers=2))
+    results = list(
+        jaxbox.stream(recorded(failures), PAPER, key=jax.random.key(0), capacity=CAPACITY, workers=2)
+    )
     assert [r.name for r in results] == ["street 0", "deadly", "street 1", "unreadable", "street 2"]
     assert "its process ended" in results[1].error
     assert results[3].error == "OSError: the disk is gone"
     for seed, result in zip(SEEDS, results[::2], strict=True):
-        assert_same_bits(result.detections, found(seed))
+        assert_same_bits(result.detections, run(street(seed).xyz, config=PAPER))

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import parity
 import pytest
-from native_loops import count_loops
+from native_loops import count_loops, loops_of
 
-from jaxbox import DetectorConfig, PointCloud, Status, detect, detector, stack_clouds, synthetic
+from jaxbox import DetectorConfig, PointCloud, Status, detect, stack_clouds, synthetic
 from jaxbox.config import BoxConfig, EvidenceConfig
 from jaxbox.config.fields import replace_fields
 from jaxbox.geometry.planar import rectangle_iou
@@ -161,11 +161,9 @@ def test_thresholds_go_in_as_one_array_that_native_loops_cut_up(preset):
 @pytest.mark.parametrize(("preset", "most"), [("default", 39), ("fast", 37), ("paper", 22)])
 def test_a_cpu_runs_no_more_loops_operation_by_operation(preset, most):
     # A loop over rows whose step grows is native code no longer, and says so by nothing but its time.
-    config = DetectorConfig.presets()[preset]
-    find = jax.jit(lambda cloud: detector.find_vehicles(cloud, config, jax.random.key(0)))
-    num_loops, num_native = count_loops(
-        find, PointCloud.from_numpy(np.zeros((1, 3), np.float32), capacity=2**17)
-    )
+    cloud = PointCloud.from_numpy(np.zeros((1, 3), np.float32), capacity=2**17)
+    with jax.default_device("cpu"):
+        num_loops, num_native = loops_of(compiled.lower(cloud, preset))
     assert num_native <= num_loops <= num_native + most
 
 

@@ -1,5 +1,6 @@
 """One decision about what a program is built for, and what the program for accelerators may hold."""
 
+import functools
 import re
 
 import jax
@@ -19,6 +20,7 @@ MERGE_LOOPS = 1
 """Suppression once more, where several readings are merged."""
 
 
+@functools.cache
 def text_for(platform, preset="default"):
     cloud = PointCloud.from_numpy(np.zeros((1, 3), np.float32), capacity=CAPACITY)
     return compiled.lower(cloud, DetectorConfig.presets()[preset], platform=platform).as_text()

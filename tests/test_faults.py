@@ -54,6 +54,8 @@ def faults(monkeypatch):
 def test_killed_and_resumed_a_run_ends_as_if_nothing_had_happened(tmp_path, faults, monkeypatch):
     # Processes of their own, which share the compiled detector of these tests.
     monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "cache"))
+    # The preset that each of them has soonest.
+    monkeypatch.setattr(faults, "OPTIONS", (*faults.OPTIONS, "--preset", "paper"))
     faults.write_sweeps(tmp_path / "sweeps", 2)
     report = faults.kill_and_resume(tmp_path / "sweeps", tmp_path, kills=3, seed=1)
     assert report["kills"] == 3

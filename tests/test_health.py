@@ -10,7 +10,8 @@ from jaxbox.config import HealthConfig
 from jaxbox.evaluation.corruptions import CORRUPTIONS
 from jaxbox.synthetic.situations import SITUATIONS
 
-CAPACITY = 65_536
+CAPACITY = 2**17
+"""For which other tests compile the default preset too."""
 DOUBTS = Status.DEGRADED | Status.DOUBTFUL_GROUND
 
 

@@ -1,6 +1,8 @@
 """JAX's own ways, one test each: 64 bits, strict promotion, meshes, gradients, export, transfer guards."""
 
+import collections
 import dataclasses
+import re
 
 import chex
 import jax
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 
 from jaxbox import DetectorConfig, PointCloud, detect, stack_clouds, synthetic
+from jaxbox.run import compiled
 from jaxbox.xla import backend
 from quality import bad_input
 
@@ -51,17 +54,37 @@ def avals_in(jaxpr):
                 yield from avals_in(part)
 
 
-@pytest.mark.parametrize("wide", [False, True])
-@pytest.mark.parametrize("preset", ["default", "paper"])
+def widened(cloud, config):
+    """The same numbers in 64 bits."""
+    cloud = jax.tree.map(lambda a: jnp.asarray(a, a.dtype.kind + "8"), cloud)
+    assert cloud.xyz1.dtype == jnp.float64
+    return cloud, jax.tree.map(jnp.float64, config)
+
+
+@pytest.mark.parametrize(("preset", "wide"), [("default", False), ("paper", True)])
 def test_with_64_bits_enabled_the_bits_are_those_without(preset, wide):
     config, cloud = DetectorConfig.presets()[preset], street()
     expected = jax.device_get(detect(cloud, config))
     with enable_x64(True):
-        if wide:
-            cloud = jax.tree.map(lambda a: jnp.asarray(a, a.dtype.kind + "8"), cloud)
-            assert cloud.xyz1.dtype == jnp.float64
-            config = jax.tree.map(jnp.float64, config)
-        assert_same_bits(detect(cloud, config), expected)
+        given = widened(cloud, config) if wide else (cloud, config)
+        assert_same_bits(detect(*given), expected)
+
+
+@pytest.mark.parametrize("preset", ["default", "paper"])
+def test_with_64_bits_enabled_arrays_of_64_bits_are_converted_and_else_the_program_is_the_same(preset):
+    # So that one of the two need be compiled.
+    given = street(), DetectorConfig.presets()[preset]
+    with enable_x64(True):
+        narrow, wide = (operations_of(compiled.lower(*each)) for each in (given, widened(*given)))
+    assert narrow - wide == collections.Counter()
+    added = (wide - narrow).elements()
+    assert sorted(operation.split()[2] for operation in added) == 3 * ["stablehlo.convert"]
+
+
+def operations_of(lowered):
+    """How often a program has each operation, whatever the names of its values."""
+    lines = (line for line in lowered.as_text().splitlines() if "@main" not in line)
+    return collections.Counter(re.sub(r"%\w+", "%", line).strip() for line in lines)
 
 
 def test_with_64_bits_enabled_a_batch_has_the_bits_of_the_singles():
@@ -74,26 +97,20 @@ def test_with_64_bits_enabled_a_batch_has_the_bits_of_the_singles():
 
 @pytest.mark.parametrize("accelerator", [False, True])
 @pytest.mark.parametrize("preset", PRESETS)
-def test_with_64_bits_enabled_the_program_computes_in_32(preset, accelerator):
+def test_with_64_bits_enabled_the_program_computes_in_32_and_promotes_no_type_and_no_rank(
+    preset, accelerator
+):
+    strict = jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise")
     config, clouds = DetectorConfig.presets()[preset], stack_clouds([street(), street()])
-    with backend.building_for(accelerator=accelerator), enable_x64(True):
+    with backend.building_for(accelerator=accelerator), enable_x64(True), strict[0], strict[1]:
         many = jax.make_jaxpr(jax.vmap(lambda cloud: detect(cloud, config)))(clouds)
-        single = jax.make_jaxpr(lambda cloud: detect(cloud, config))(street())
+        single, answer = jax.make_jaxpr(lambda cloud: detect(cloud, config), return_shape=True)(street())
+    assert answer.valid.shape == (config.vehicles.max_detections,)
     for program in (single, many):
         avals = [aval for aval in avals_in(program.jaxpr) if hasattr(aval, "dtype")]
         assert len(avals) > 1000
         # Python's numbers, and in JAX 0.6 the place of an entry that is known, are of 64 bits.
         assert not [aval for aval in avals if str(aval.dtype) in WIDE and aval.size > 2]
-
-
-@pytest.mark.parametrize("accelerator", [False, True])
-@pytest.mark.parametrize("preset", PRESETS)
-def test_no_type_and_no_rank_is_promoted(preset, accelerator):
-    strict = jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise")
-    config = DetectorConfig.presets()[preset]
-    with backend.building_for(accelerator=accelerator), strict[0], strict[1]:
-        answer = jax.eval_shape(jax.jit(lambda cloud: detect(cloud, config)), street())
-    assert answer.valid.shape == (config.vehicles.max_detections,)
 
 
 def assert_same_boxes(many, clouds):

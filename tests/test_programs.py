@@ -97,18 +97,16 @@ def test_the_random_key_is_an_input(kept):
     assert kept.num_compiled == 1
 
 
-def test_without_evidence_it_has_the_bits_of_detect(tmp_path):
+def test_without_evidence_and_on_another_device_it_has_the_bits_of_detect_and_stays_there(tmp_path):
+    kept, second = KeptPrograms(tmp_path), jax.devices("cpu")[1]
     cloud, paper = PointCloud.from_numpy(street(1).xyz, capacity=CAPACITY), DetectorConfig.paper()
-    assert_same_bits(run(KeptPrograms(tmp_path), cloud, paper), jaxbox.detect(cloud, paper))
-
-
-def test_on_another_device_it_has_the_bits_and_stays_there(kept):
-    second = jax.devices("cpu")[1]
-    answer = run(kept, jax.device_put(CLOUD, second))
+    expected = jax.device_get(jaxbox.detect(cloud, paper))
+    assert_same_bits(run(kept, cloud, paper), expected)
+    answer = run(kept, jax.device_put(cloud, second), paper)
     assert answer.center.devices() == {second}
-    assert_same_bits(answer, found(0))
+    assert_same_bits(answer, expected)
     with jax.default_device(second):
-        assert run(kept).center.devices() == {second}
+        assert run(kept, cloud, paper).center.devices() == {second}
     assert kept.num_compiled == 2
 
 

@@ -8,6 +8,7 @@ import re
 
 import jax
 import numpy as np
+import parity
 import pytest
 
 from jaxbox import Label, PointCloud, Status, detect, stack_clouds, summarise
@@ -247,7 +248,8 @@ def rounds():
     """Runs with ever larger capacities, as the errors ask for, until nothing overflows."""
     cloud, config, runs = PointCloud.from_numpy(STREET, capacity=2**14), SMALL, []
     for _ in range(MAX_ROUNDS):
-        detections = detect(cloud, config).on_host()
+        with parity.compiled_quickly():
+            detections = detect(cloud, config).on_host()
         runs.append((config, detections))
         if not Status(int(detections.status)) & CAPACITY_BITS:
             break
@@ -322,7 +324,8 @@ def test_a_capacity_for_obstacles_that_suffices_changes_nothing(rounds):
 
     def found(max_obstacles):
         clustering = dataclasses.replace(config.clustering, max_obstacles=max_obstacles)
-        return jax.device_get(detect(cloud, dataclasses.replace(config, clustering=clustering)))
+        with parity.compiled_quickly():
+            return jax.device_get(detect(cloud, dataclasses.replace(config, clustering=clustering)))
 
     # Points are gone through in chunks of 4,096: one capacity is a whole number of them.
     odd, even = found(2500), found(8192)

@@ -185,6 +185,17 @@ def test_map_batches_is_vmap(size):
     np.testing.assert_array_equal(mapped, values[:, ::-1] - values[:, :1])
 
 
+@pytest.mark.parametrize(("together", "num_loops"), [(None, 0), (True, 0), (False, 1)])
+def test_on_an_accelerator_rows_go_together_unless_the_caller_says_otherwise(
+    together, num_loops, monkeypatch
+):
+    # Which concerns functions that scatter, as their callers know.
+    monkeypatch.setenv("XLA_FLAGS", "--xla_gpu_deterministic_ops=true")
+    with backend.building_for(accelerator=True):
+        mapped = jax.jit(lambda rows: loops.map_batches(lambda x: 2 * x, rows, chunk=1, together=together))
+        assert mapped.lower(np.arange(3.0)).as_text().count("stablehlo.while") == num_loops
+
+
 @pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("times", [0, 1, 5])
 def test_repeat_applies_a_function_so_many_times(times):

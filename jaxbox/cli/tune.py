@@ -216,7 +216,8 @@ def frame_groups(
         drive_of: dict[pathlib.Path, str] = {}
         for file in dict.fromkeys(drives.values()):
             folders = [folder for folder in drives if drives[folder] == file]
-            found = open_sweeps(folders)
+            # A file names its sweeps as they are called without those of the others.
+            found = sweeps if len(folders) == len(drives) else open_sweeps(folders)
             drive_of |= _folder_groups(found) if file is None else _drives_in(file, found, labelled)
         return "drive", {name: drive_of[paths[name]] for name in names}
     folder_of = _folder_groups(sweeps)

@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxbox.xla.backend import batch_together, on_accelerator
+from jaxbox.xla.backend import on_accelerator
 from jaxbox.xla.barriers import materialize
 
 
@@ -172,18 +172,22 @@ def fold_rows(
     return for_chunks(num_rows, chunk, step, state)
 
 
-def map_batches(function: Callable[[Any], Any], rows: Any, *, chunk: int) -> Any:
+def map_batches(
+    function: Callable[[Any], Any], rows: Any, *, chunk: int, together: bool | None = None
+) -> Any:
     """Applies a function to all rows, a chunk at a time on a CPU. Law: `jax.vmap(function)(rows)`.
 
     Args:
       function: of one row.
       rows: pytree of (P, ...) arrays.
       chunk: static, rows at a time; a single one is not batched, so that its scatters stay as fast.
+      together: static, whether all rows are taken at once; None for on an accelerator. A function that
+        scatters asks `batch_together`.
 
     Returns:
       Pytree of (P, ...) arrays.
     """
-    if batch_together():
+    if on_accelerator() if together is None else together:
         return jax.vmap(function)(rows)
     return jax.lax.map(function, rows, batch_size=None if chunk == 1 else chunk)
 

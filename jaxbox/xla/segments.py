@@ -95,24 +95,31 @@ def _reduce_parallel(
 
 
 def _scatter_privatized(
-    operation: Literal["add", "max", "min"], segment: jax.Array, values: jax.Array, *, num_segments: int
+    operation: Literal["add", "max", "min"],
+    segment: jax.Array,
+    values: jax.Array,
+    *,
+    num_segments: int,
+    num_tables: int | None = None,
 ) -> jax.Array:
-    """Sums, maxima or minima of the rows of each segment, on an accelerator.
+    """Sums, maxima or minima of the rows of each segment.
 
-    Atomic updates of one address are serialized (contention), and neighbouring rows are often of one segment:
-    they go to several private tables in turn, which are reduced. There are as many tables as cost little.
+    Updates of one address wait for each other, atomic ones of an accelerator most of all (contention), and
+    neighbouring rows are often of one segment: they go to several private tables in turn, which are reduced.
 
     Args:
       operation: what to do with the rows.
-      segment: (..., N) int32, in [0, num_segments]; the latter for none.
+      segment: (..., N) int32, not negative; num_segments and above for none.
       values: (..., N, C), float32 for maxima and minima.
       num_segments: static, S.
+      num_tables: static; None for as many as cost an accelerator little.
 
     Returns:
       (S, C): 0, or infinite, where a segment has no row.
     """
     columns = values.shape[-1]
-    num_tables = max(min(chunks.MAX_TABLES, chunks.TABLE_NUMBERS // max(num_segments * columns, 1)), 1)
+    if num_tables is None:
+        num_tables = max(min(chunks.MAX_TABLES, chunks.TABLE_NUMBERS // max(num_segments * columns, 1)), 1)
     table = jax.lax.broadcasted_iota(jnp.int32, segment.shape, segment.ndim - 1) % num_tables
     # What lies past the last segment would be another table's.
     place = jnp.where(segment < num_segments, table * num_segments + segment, num_tables * num_segments)
@@ -184,15 +191,10 @@ def segment_minima(
     Returns:
       (S,) float32, infinite where there is none.
     """
-    if on_accelerator():
-        segment = jnp.where(valid, segment, num_segments)
-        return _scatter_privatized("min", segment, values[:, None], num_segments=num_segments)[:, 0]
-    table = jnp.arange(values.shape[0], dtype=jnp.int32) % chunks.MINIMA_TABLES
-    num_places = chunks.MINIMA_TABLES * num_segments
-    # What lies past the last segment would be another table's.
-    place = jnp.where(valid & (segment < num_segments), table * num_segments + segment, num_places)
-    lowest = jnp.full(num_places, jnp.inf, jnp.float32).at[place].min(values, mode="drop")
-    return jnp.min(lowest.reshape(chunks.MINIMA_TABLES, -1), axis=0)
+    num_tables = None if on_accelerator() else chunks.MINIMA_TABLES
+    segment, own = jnp.where(valid, segment, num_segments), values[:, None]
+    lowest = _scatter_privatized("min", segment, own, num_segments=num_segments, num_tables=num_tables)
+    return lowest[:, 0]
 
 
 def argmax_key(value: jax.Array, index: jax.Array, num_rows: int) -> jax.Array:
