@@ -61,5 +61,10 @@ def test_the_interface_names_the_arrays_of_the_module_in_their_order(folder):
 def test_what_cannot_be_exported_is_refused(tmp_path):
     with pytest.raises(ValueError, match="capacity is 0"):
         export.export_detector(0)
+    (file := tmp_path / "file").touch()
+    taken = CliRunner().invoke(app, ["export", "--output", str(file)])
+    assert taken.exit_code == 2
+    assert f"{file}: cannot be written (File exists)" in taken.output.replace("\n", "")
+    assert "it is a folder" in taken.output.replace("\n", " ")
     unknown = CliRunner().invoke(app, ["export", "--output", str(tmp_path), "--platform", "abacus"])
     assert unknown.exit_code == 2
