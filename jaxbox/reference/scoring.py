@@ -29,9 +29,10 @@ PSEUDO_COUNT = 5
 CUT_SLACK_M = 0.1
 """Tops from so much below the highest beam on are more and more taken to be cut off by it."""
 UPRIGHT_RAMP_M = 0.1
-BUMPER_RAMP_M, BUMPER_WIDTHS = 10.0, (0.6, 0.8)
+"""Over so much height a rear becomes one that may be upright."""
+BUMPER_RAMP_M, NEARLY_WIDE = 10.0, (0.6, 0.8)
 """A far box may be a bumper alone: the more the farther over so much range, and the wider between these
-shares of the class's width."""
+shares of the class's width; likewise the rear of a high car."""
 WIDE = 0.4
 """A box of less than this share of the class's width is seen from one side: it may be a wall."""
 MAX_END_MARGIN_M = 0.4
@@ -354,7 +355,7 @@ def neighbourhood_score(
     share = around.num_recessed + PSEUDO_COUNT * config.recess_share
     share = share / (around.num_upper + PSEUDO_COUNT)
     tall = np.interp(around.top - prior.upright_from_m, [0, UPRIGHT_RAMP_M], [0, 1])
-    tall *= np.interp(seen_width, BUMPER_WIDTHS, [0, 1])
+    tall *= np.interp(seen_width, NEARLY_WIDE, [0, 1])
     least = config.upright_score + (config.tall_upright_score - config.upright_score) * tall
     upright = least + (1 - least) * min(1.0, share / config.recess_share)
     return float(score * upright), unseen > seen
@@ -369,7 +370,7 @@ def _share_unseen(
         cut = is_cut * min(2 * share, 1.0)
     if top > prior.min_bumper_m:
         bumper = np.interp(rho - float(config.bumper_from_m), [0, BUMPER_RAMP_M], [0, 1])
-        bumper *= np.interp(share, BUMPER_WIDTHS, [0, 1])
+        bumper *= np.interp(share, NEARLY_WIDE, [0, 1])
     return float(config.unseen_top_score * max(cut, bumper))
 
 

@@ -45,9 +45,11 @@ passes when nothing is known of it."""
 UPRIGHT_RAMP_M = 0.1
 """So much above the least height of an upright rear it is one in full."""
 
-BUMPER_RAMP_M, BUMPER_WIDTHS = 10.0, (0.6, 0.8)
-"""What is seen of a far vehicle is more and more often a bumper alone: over so much range; and between these
-fractions of the class's width it is believed to be one."""
+BUMPER_RAMP_M = 10.0
+"""What is seen of a far vehicle is more and more often a bumper alone: over so much range."""
+
+NEARLY_WIDE = 0.6, 0.8
+"""Between these measured fractions of the class's width a bumper is believed to be one, and a rear whole."""
 
 
 WIDE = 0.4
@@ -385,7 +387,7 @@ def _upright_score(
 
 def _nearly_wide(seen_width: jax.Array) -> jax.Array:
     """(P,) in [0, 1]: whether nearly the class's width was measured."""
-    narrow, wide = BUMPER_WIDTHS
+    narrow, wide = NEARLY_WIDE
     return jnp.clip((seen_width - narrow) / (wide - narrow), 0, 1)
 
 
