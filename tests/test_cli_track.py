@@ -377,6 +377,7 @@ def test_smoothing_and_coasting_and_scores_change_what_is_written(kitti, tmp_pat
         "smooth": ["--smooth"],
         "confirmed": ["--confirmed"],
         "high": ["--min-score", "0.3"],
+        "low": ["--min-score", "0"],
         "all": [],
     }.items():
         assert track(kitti, tmp_path / name, *LIGHT, *extra, "--quiet").exit_code == 0
@@ -387,6 +388,12 @@ def test_smoothing_and_coasting_and_scores_change_what_is_written(kitti, tmp_pat
     scores = [box["score"] for record in outputs["high"] for box in record["boxes"]]
     assert scores
     assert min(scores) >= 0.3
+    # KITTI's benchmark takes every line for an answer, so text has what is shown unless scores are asked for.
+    texts = {name: (tmp_path / name / "0000.txt").read_text().splitlines() for name in outputs}
+    assert outputs["low"] == outputs["all"]
+    assert min(float(line.split()[-1]) for line in texts["low"]) < SHOWN_MIN_SCORE
+    assert texts["all"] == [line for line in texts["low"] if float(line.split()[-1]) >= SHOWN_MIN_SCORE]
+    assert texts["all"]
     smooth = io.read_tracks(tmp_path / "smooth" / "0000.txt")
     assert {item.track_id for item in smooth} <= {
         box["id"] for record in outputs["smooth"] for box in record["boxes"]
@@ -457,7 +464,7 @@ def test_settings_of_the_tracker_are_changed_by_name():
 
 def test_a_failure_leaves_an_earlier_file_as_it_was(tmp_path):
     wanted = {"coasting": False, "points": False, "pictures": False, "video": True, "gif": False}
-    files = functools.partial(SequenceFiles, **wanted)
+    files = functools.partial(SequenceFiles, **wanted, text_min_score=0.0)
     (tmp_path / "a.mp4").write_bytes(b"earlier")
 
     def fail():

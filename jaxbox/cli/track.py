@@ -58,6 +58,8 @@ class TrackOptions(RunOptions):
     """Whether only confirmed tracks are written."""
     coasting: bool
     """Whether KITTI text holds tracks too that were not detected in the sweep."""
+    text_min_score: float
+    """KITTI text holds no lower scores, as its benchmark takes every line for an answer."""
     points: bool
     """Whether MCAP and rerun files hold the points too."""
     pictures: bool
@@ -69,7 +71,7 @@ class TrackOptions(RunOptions):
 
     def recorded(self) -> dict:
         """What the results depend on besides the detector's settings, as JSON can hold it."""
-        names = ("poses", "rate_hz", "max_tracks", "smooth", "confirmed", "coasting")
+        names = ("poses", "rate_hz", "max_tracks", "smooth", "confirmed", "coasting", "text_min_score")
         settings = {name: float(value) for name, value in all_fields(self.track_config).items()}
         return {"track": settings} | {name: getattr(self, name) for name in names}
 
@@ -81,6 +83,7 @@ class TrackOptions(RunOptions):
             self.formats,
             # A gap that is filled between two detections is what smoothing is for.
             coasting=self.coasting or self.smooth,
+            text_min_score=self.text_min_score,
             points=self.points,
             pictures=self.pictures,
             video=self.video,

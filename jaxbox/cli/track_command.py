@@ -129,13 +129,13 @@ def track(
         ),
     ] = False,
     min_score: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar=MIN_SCORE_METAVAR,
-            help="Leave out lower scores, of all or by class; "
-            f"pictures never show less than {SHOWN_MIN_SCORE:g}.",
+            help="Leave out lower scores, of all or by class. Unless given, KITTI text holds what scores "
+            f"{SHOWN_MIN_SCORE:g} or more; pictures never show less.",
         ),
-    ] = "0",
+    ] = None,
     classes: ClassesOption = None,
     within: WithinOption = None,
     preset: PresetOption = None,
@@ -181,7 +181,7 @@ def track(
         if not rate_hz > 0:
             raise typer.BadParameter(f"--rate-hz is {rate_hz:g}; give sweeps a second, such as 10.")
         convention = PointConvention(scale, axes, flip, columns)
-        least, by_class = parse_min_score(min_score)
+        least, by_class = (0.0, {}) if min_score is None else parse_min_score(min_score)
         common: dict[str, Any] = {
             "config": chosen_config(preset, settings, changes or [], sensor=sensor),
             "track_config": chosen_track_config(track_changes or []),
@@ -217,6 +217,7 @@ def track(
             keep=keep,
             crops=crops,
             coasting=coasting,
+            text_min_score=SHOWN_MIN_SCORE if min_score is None else least,
             pictures=pictures,
             video=video,
             sheet=sheet,

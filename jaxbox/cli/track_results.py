@@ -46,10 +46,11 @@ class _Kind(NamedTuple):
     open: OpenResults
     wants_points: bool = False
     takes_coasting: bool = False
+    takes_min_score: bool = False
 
 
 _KINDS: Mapping[TrackFormat, _Kind] = {
-    TrackFormat.KITTI: _Kind(".txt", open_track_text, takes_coasting=True),
+    TrackFormat.KITTI: _Kind(".txt", open_track_text, takes_coasting=True, takes_min_score=True),
     TrackFormat.JSONL: _Kind(".jsonl", open_jsonl),
     TrackFormat.PARQUET: _Kind(".parquet", functools.partial(open_parquet, columns=TRACK_COLUMNS)),
     TrackFormat.CSV: _Kind(".csv", functools.partial(open_csv, columns=TRACK_COLUMNS)),
@@ -79,6 +80,7 @@ class SequenceFiles:
         formats: frozenset[TrackFormat],
         *,
         coasting: bool,
+        text_min_score: float,
         points: bool,
         pictures: bool,
         video: bool,
@@ -86,7 +88,8 @@ class SequenceFiles:
     ) -> None:
         """Opens nothing yet: a sequence of which no sweep can be read leaves no file."""
         self._output, self._sequence, self._formats = output, sequence, formats
-        self._coasting, self._points, self._pictures, self._video = coasting, points, pictures, video
+        self._coasting, self._text_min_score = coasting, text_min_score
+        self._points, self._pictures, self._video = points, pictures, video
         self._gif, self._gif_step = gif, 1
         self._stack = contextlib.ExitStack()
         self._writers: list[tuple[_Kind, WriteResult]] | None = None
@@ -179,7 +182,8 @@ class SequenceFiles:
         self.has_camera = has_camera or TrackFormat.KITTI not in self._formats
         for name, kind in _KINDS.items():
             if name in formats:
-                options = {"coasting": self._coasting} if kind.takes_coasting else {}
+                options: dict[str, Any] = {"coasting": self._coasting} if kind.takes_coasting else {}
+                options |= {"min_score": self._text_min_score} if kind.takes_min_score else {}
                 begin = functools.partial(kind.open, **options)
                 writers.append((kind, self._stack.enter_context(begin(self._path(kind.suffix)))))
         return writers

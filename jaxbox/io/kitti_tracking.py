@@ -237,7 +237,7 @@ def objects_from_tracks(
 
 
 def objects_from_record(
-    record: Mapping[str, Any], calibration: Calibration, *, coasting: bool = False
+    record: Mapping[str, Any], calibration: Calibration, *, coasting: bool = False, min_score: float = 0.0
 ) -> list[KittiObject]:
     """Turns what is written of a sweep's tracks into KITTI results: those that the camera sees.
 
@@ -245,11 +245,13 @@ def objects_from_record(
       record: as `jaxbox.io.tracks_record` makes it.
       calibration: the camera whose image the 2D boxes are in.
       coasting: whether tracks are written too that were not detected in the sweep.
+      min_score: tracks that score less are left out.
 
     Returns:
       The objects, whose ``rotation_y`` points to the front.
     """
-    boxes = [box for box in record["boxes"] if coasting or box["detection"] >= 0]
+    seen = [box for box in record["boxes"] if coasting or box["detection"] >= 0]
+    boxes = [box for box in seen if box["score"] >= min_score]
     return objects_from_tracks(
         np.array([[*box["center"], *box["size"], box["heading"]] for box in boxes]),
         np.array([box["score"] for box in boxes]),
@@ -261,12 +263,15 @@ def objects_from_record(
 
 
 @contextlib.contextmanager
-def open_track_text(path: pathlib.Path, *, coasting: bool = False) -> Iterator[WriteResult]:
+def open_track_text(
+    path: pathlib.Path, *, coasting: bool = False, min_score: float = 0.0
+) -> Iterator[WriteResult]:
     """Opens a tracking result file for the tracks of a drive.
 
     Args:
       path: the file, which KITTI names after the sequence: ``0000.txt``.
       coasting: as `objects_from_record`.
+      min_score: likewise.
 
     Yields:
       What adds a sweep; one without calibration adds nothing.
@@ -275,7 +280,9 @@ def open_track_text(path: pathlib.Path, *, coasting: bool = False) -> Iterator[W
 
     def write(result: SweepResult) -> None:
         if result.calibration is not None:
-            objects.extend(objects_from_record(result.record, result.calibration, coasting=coasting))
+            objects.extend(
+                objects_from_record(result.record, result.calibration, coasting=coasting, min_score=min_score)
+            )
 
     yield write
     write_tracks(path, objects)
