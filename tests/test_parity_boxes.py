@@ -298,7 +298,7 @@ def test_the_second_peak_of_a_curve_is_far_from_the_best_and_nearly_as_good(plat
     at, height, width = rng.integers(0, 90, (2, 200)), rng.uniform(0.9, 1, (2, 200)), rng.uniform(3, 12, 200)
     turn = np.abs(np.arange(90)[:, None, None] - at)
     turn = np.minimum(turn, 90 - turn)
-    curve = np.max(height * np.exp(-((turn / width) ** 2)), axis=1).astype(np.float32)
+    curve = np.max(height * np.exp(-((turn / width) ** 2)), axis=1, initial=1e-3).astype(np.float32)
     num_points = rng.integers(20, 60, 200).astype(np.int32)
     max_loss = np.float32(0.03)
     left = np.asarray(second_peak(curve, num_points, max_loss=max_loss))
@@ -310,7 +310,10 @@ def test_the_second_peak_of_a_curve_is_far_from_the_best_and_nearly_as_good(plat
     assert 20 < changed.sum() < 150
     assert (num_points[changed] >= 30).all()
     apart = np.abs(left.argmax(axis=0) - curve.argmax(axis=0))[changed]
-    assert (np.minimum(apart, 90 - apart) >= 15).all()
+    assert (np.minimum(apart, 90 - apart) >= 10).all()
+    peaks = np.isfinite(left[:, changed])
+    neighbours = np.maximum(np.roll(curve, 1, axis=0), np.roll(curve, -1, axis=0))[:, changed]
+    assert (curve[:, changed][peaks] >= neighbours[peaks]).all()
     assert (left.max(axis=0) > curve.max(axis=0) - 0.03).all()
     without = np.asarray(second_peak(curve, num_points, max_loss=np.float32(0)))
     np.testing.assert_array_equal(without, curve)

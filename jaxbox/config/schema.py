@@ -256,8 +256,8 @@ class BoxConfig:
     """Boxes with a shorter longest extent do not vote."""
     direction_max_free: Scalar = 0.15
     """Boxes with a larger part of their area seen to be free do not vote."""
-    second_peak_loss: Scalar = 0.03
-    """A cluster is also tried at a second rotation where its closeness there is worse by less than this;
+    second_peak_loss: Scalar = 0.05
+    """A cluster is also tried at a second peak of its closeness where that is lower by less than this;
     0 tries none. See ``completion.along_scene``."""
 
 

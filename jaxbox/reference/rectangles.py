@@ -79,18 +79,19 @@ def rectangle_candidates(
 
 
 def second_peak(curve: np.ndarray, num_points: int, *, max_loss: float) -> np.ndarray:
-    """A curve without what is less than 15 degrees from its best rotation.
+    """The peaks of a curve that are 10 degrees or more from its best rotation.
 
     Args:
       curve: (A,) larger is better.
       num_points: that it is of.
-      max_loss: how much worse another rotation may be.
+      max_loss: how much worse another peak may be.
 
     Returns:
-      (A,); the curve itself of less than 30 points, or where nothing farther comes so near to the best.
+      (A,); the curve itself of less than 30 points, or where no peak farther comes so near to the best.
     """
     turn = np.abs(np.arange(len(curve)) - np.argmax(curve)) * 90 / len(curve)
-    others = np.where(np.minimum(turn, 90 - turn) >= 15, curve, -np.inf)
+    is_peak = curve >= np.maximum(np.roll(curve, 1), np.roll(curve, -1))
+    others = np.where(is_peak & (np.minimum(turn, 90 - turn) >= 10), curve, -np.inf)
     return others if num_points >= 30 and others.max() > curve.max() - max_loss else curve
 
 

@@ -20,7 +20,7 @@ from jaxbox.xla.sorting import largest_first
 PREFERENCE_GAIN = 5.0
 """How often the scene's direction counts for the second candidate of a cluster: it bends a closeness only."""
 
-PEAKS_APART_DEG, MIN_PEAK_POINTS = 15.0, 30
+PEAKS_APART_DEG, MIN_PEAK_POINTS = 10.0, 30
 """A second peak differs by so much from the best rotation, and is looked for where a rectangle is fitted to
 so many points: to weigh it takes time."""
 
@@ -104,18 +104,18 @@ def rectangle_candidates(
 
 
 def second_peak(curve: jax.Array, num_points: jax.Array, *, max_loss: Scalar) -> jax.Array:
-    """What is left of curves apart from their best rotation, where something else is nearly as good.
+    """The peaks of curves apart from their best rotation, where one of them is nearly as good.
 
     A vehicle that is seen in part may fit nearly as well at two rotations, and a little noise decides.
 
     Args:
       curve: (A, P) float32, see `try_rotations`.
       num_points: (P,) int32, that they are of.
-      max_loss: () of the curve's value, from the best rotation to another that is nearly as good.
+      max_loss: () of the curve's value, from the best rotation to a peak that is nearly as good.
 
     Returns:
-      (A, P) float32: minus infinity near the best rotation. The curve itself of few points, and where no
-      other rotation is nearly as good.
+      (A, P) float32: minus infinity but at peaks apart from the best rotation. The curve itself of few
+      points, and where no other peak is nearly as good.
 
     Reference: oracle `jaxbox.reference.second_peak`.
     """
@@ -123,7 +123,8 @@ def second_peak(curve: jax.Array, num_points: jax.Array, *, max_loss: Scalar) ->
     best, greatest = first_argmax(curve)
     turn = jnp.abs(jnp.arange(num_angles, dtype=jnp.int32)[:, None] - best[None])
     apart_deg = jnp.minimum(turn, num_angles - turn).astype(jnp.float32) * (90 / num_angles)
-    others = jnp.where(apart_deg >= PEAKS_APART_DEG, curve, -jnp.inf)
+    is_peak = (curve >= jnp.roll(curve, 1, axis=0)) & (curve >= jnp.roll(curve, -1, axis=0))
+    others = jnp.where(is_peak & (apart_deg >= PEAKS_APART_DEG), curve, -jnp.inf)
     has_other = (num_points >= MIN_PEAK_POINTS) & (jnp.max(others, axis=0) > greatest - max_loss)
     return jnp.where(has_other[None], others, curve)
 
