@@ -8,6 +8,9 @@ import numpy as np
 CAPACITY_BUCKETS: tuple[int, ...] = tuple(2**k for k in range(14, 21))
 """Point capacities that a sweep is padded to: 16,384 to 1,048,576. One compile a bucket."""
 
+MAX_COLUMNS = 16
+"""An array of more columns has a row for x, one for y and one for z instead: no source has as many fields."""
+
 ALIGNMENT_BYTES = 64
 """XLA takes a host array without a copy where its memory starts at a multiple of this."""
 

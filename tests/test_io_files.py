@@ -58,6 +58,20 @@ def test_text_points_are_read_with_blanks_commas_headings_and_more_columns(tmp_p
     np.testing.assert_array_equal(intensity, INTENSITY)
 
 
+@pytest.mark.parametrize(
+    ("text", "intensity"),
+    [
+        ("x,y,z,time,intensity\n1.5,-2,0.25,0,0.25\n30,4,-1.75,0.1,0.5\n", INTENSITY),
+        ("x y z ring reflectivity\n1.5 -2 0.25 7 0.25\n30 4 -1.75 9 0.5\n", INTENSITY),
+        ("x y z ring\n1.5 -2 0.25 7\n30 4 -1.75 9\n", np.zeros(2)),
+    ],
+)
+def test_the_first_line_of_text_points_names_the_intensity(tmp_path, text, intensity):
+    xyz, found = io.read_points(write(tmp_path / "a.csv", text))
+    np.testing.assert_array_equal(xyz, XYZ)
+    np.testing.assert_array_equal(found, intensity)
+
+
 def test_text_points_without_intensity_have_zeros_and_may_be_nan(tmp_path):
     xyz, intensity = io.read_points(write(tmp_path / "a.xyz", "1 2 3\nnan inf 1e300\n"))
     np.testing.assert_array_equal(xyz, np.float32([[1, 2, 3], [np.nan, np.inf, np.inf]]))

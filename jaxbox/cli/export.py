@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import jax
 from rich.console import Console
 
-from jaxbox.cli.console import OutputError
+from jaxbox.cli.results import written
 from jaxbox.config import DetectorConfig
 from jaxbox.run.export import export_detector, write_exported
 
@@ -44,14 +44,9 @@ def run_export(
       OutputError: where the folder cannot be made or written, the first before the detector is lowered.
     """
     names = [platform.value for platform in platforms] or None
-    try:
+    with written(output, advice="or choose another --output; it is a folder."):
         output.mkdir(parents=True, exist_ok=True)
         exported = export_detector(capacity, config, jax.random.key(seed), platforms=names)
         paths = write_exported(output, exported)
-    except OSError as error:
-        raise OutputError(
-            f"{output}: cannot be written ({error.strerror or error}). Free space or fix the permissions, or "
-            "choose another --output; it is a folder."
-        ) from error
     for path in paths:
         console.print(f"wrote {path} ({path.stat().st_size / 1e6:.1f} MB)", markup=False)

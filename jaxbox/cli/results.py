@@ -63,12 +63,16 @@ FILES: Mapping[ResultFormat, ResultFile] = {
 """Formats of one file a run; KITTI text is one a sweep."""
 
 
+_RESUME_ADVICE = "and run the same command with --resume; or choose another --output."
+
+
 @contextlib.contextmanager
-def written(path: pathlib.Path) -> Iterator[None]:
+def written(path: pathlib.Path, *, advice: str = _RESUME_ADVICE) -> Iterator[None]:
     """Tells failures to write from failures to read: after the first a run cannot go on.
 
     Args:
       path: the file or folder, for the error.
+      advice: what else to do than to free space or fix the permissions.
 
     Raises:
       OutputError: in place of an OSError of the block.
@@ -77,8 +81,8 @@ def written(path: pathlib.Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise OutputError(
-            f"{path}: cannot be written ({error.strerror or error}). Free space or fix the permissions, and "
-            "run the same command with --resume; or choose another --output."
+            f"{path}: cannot be written ({error.strerror or error}). Free space or fix the permissions, "
+            + advice
         ) from error
 
 

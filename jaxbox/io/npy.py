@@ -13,6 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from jaxbox._files import InputError, check_file, reason
+from jaxbox._padding import MAX_COLUMNS
 from jaxbox.io.point_times import TIME_NAMES, timed_reader
 from jaxbox.io.points import (
     PointFormat,
@@ -21,7 +22,6 @@ from jaxbox.io.points import (
     check_unpacked,
     named_points,
 )
-from jaxbox.run.arguments import MAX_COLUMNS
 
 ARRAY_NAMES = ("points", "xyz", "pointcloud", "data", "arr_0")
 """Arrays that are looked for in a .npz file of several, in this order; its only one needs no name."""

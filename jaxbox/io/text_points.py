@@ -3,12 +3,13 @@
 import array
 import math
 import os
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxbox._files import InputError, read_text
 from jaxbox.io.point_times import TIME_NAMES, point_times_s
-from jaxbox.io.points import PointFormat, Points, TimedPoints, check_num_points
+from jaxbox.io.points import INTENSITY_NAMES, PointFormat, Points, TimedPoints, check_num_points
 
 _VALUES_PER_POINT = 4
 
@@ -16,15 +17,16 @@ _VALUES_PER_POINT = 4
 def read_text_points(path: str | os.PathLike[str]) -> Points:
     """Reads text points: ``x y z [intensity]`` a line, between them blanks or commas.
 
-    Empty lines and lines that begin with ``#`` are skipped, and so is a first line of column names.
-    Columns after the fourth are ignored, but for the times of `read_timed_text_points`.
+    Empty lines and lines that begin with ``#`` are skipped. A first line of column names, x y z and any
+    others, says which column is the intensity (`INTENSITY_NAMES`) and which the time of
+    `read_timed_text_points`; other columns are ignored.
 
     Args:
       path: the file; one without points is a sweep without points.
 
     Returns:
       xyz: (n, 3) float32, m, sensor frame.
-      intensity: (n,) float32; 0 where there is no fourth column.
+      intensity: (n,) float32; 0 where there is no fourth column, or none of those named is the intensity.
 
     Raises:
       InputError: naming file and line, for a line that is not numbers, or has fewer than three columns,
@@ -51,33 +53,41 @@ def read_timed_text_points(path: str | os.PathLike[str]) -> TimedPoints:
     return TimedPoints(points[:, :3], points[:, 3], time_s)
 
 
+class _Columns(NamedTuple):
+    """Which columns hold what, besides x, y, z in the first three."""
+
+    intensity: int | None = 3
+    time: int | None = None
+    num_named: float = math.inf
+
+
 def _read_rows(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray | None]:
     """x, y, z and intensity (n, 4) float32, and the column of times, if any."""
-    columns, num_named, values = 0, math.inf, array.array("d")
-    time_column, times = None, array.array("d")
+    num_columns, columns = 0, _Columns()
+    values, times = array.array("d"), array.array("d")
     for number, line in enumerate(read_text(path).replace(",", " ").splitlines(), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
-        if not columns and _is_header(words):
-            time_column, num_named = _time_column(words), len(words)
+        if not num_columns and _is_header(words):
+            columns = _named_columns(words)
             continue
-        columns = columns or len(words)
+        num_columns = num_columns or len(words)
         where = f"{path}, line {number}"
-        if columns > num_named:
+        if num_columns > columns.num_named:
             raise InputError(
-                f"{where}: {columns} columns, and the first line names {num_named}. Write no column before "
-                "x, as pandas does without index=False, and no comma within a number."
+                f"{where}: {num_columns} columns, and the first line names {columns.num_named}. Write no "
+                "column before x, as pandas does without index=False, and no comma within a number."
             )
-        values.extend(_parse_point(words, columns, where))
-        if time_column is not None:
-            times.append(_parse_time(words, time_column, where))
+        values.extend(_parse_point(words, num_columns, columns.intensity, where))
+        if columns.time is not None:
+            times.append(_parse_time(words, columns.time, where))
     points = np.array(values).reshape(-1, _VALUES_PER_POINT)
     check_num_points(len(points), str(path))
     # A number beyond float32's range becomes infinite, and is counted by the detector.
     with np.errstate(over="ignore"):
         points = points.astype(np.float32)
-    return points, None if time_column is None else np.array(times)
+    return points, None if columns.time is None else np.array(times)
 
 
 def _names(words: list[str]) -> list[str]:
@@ -88,20 +98,26 @@ def _is_header(words: list[str]) -> bool:
     return _names(words[:3]) == ["x", "y", "z"]
 
 
-def _time_column(words: list[str]) -> int | None:
+def _named_columns(words: list[str]) -> _Columns:
     names = _names(words)
-    return next((names.index(name) for name in TIME_NAMES if name in names), None)
+    place = {name: names.index(name) for name in names}
+    intensity, time = (
+        next((place[name] for name in wanted if name in place), None)
+        for wanted in (INTENSITY_NAMES, TIME_NAMES)
+    )
+    return _Columns(intensity, time, len(names))
 
 
-def _parse_point(words: list[str], columns: int, where: str) -> list[float]:
+def _parse_point(words: list[str], columns: int, intensity: int | None, where: str) -> list[float]:
     if len(words) != columns or columns < _VALUES_PER_POINT - 1:
         raise InputError(
             f"{where}: {len(words)} columns; each line needs x y z [intensity], and all lines as many."
         )
+    point = words[:3] if intensity is None or intensity >= columns else [*words[:3], words[intensity]]
     try:
-        values = [float(word) for word in words[:_VALUES_PER_POINT]]
+        values = [float(word) for word in point]
     except ValueError as error:
-        raise InputError(f"{where}: {' '.join(words)[:60]!r} is not x y z [intensity] in numbers.") from error
+        raise InputError(f"{where}: {' '.join(point)[:60]!r} is not x y z [intensity] in numbers.") from error
     return values if len(values) == _VALUES_PER_POINT else [*values, 0.0]
 
 

@@ -10,14 +10,12 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbox._padding import unmasked
+from jaxbox._padding import MAX_COLUMNS, unmasked
 from jaxbox.config import DetectorConfig
 from jaxbox.types import PointCloud
 
 _COLUMNS = 3
 """x, y, z; a fourth is the intensity."""
-MAX_COLUMNS = 16
-"""An array of more columns has a row for x, one for y and one for z instead: no source has as many fields."""
 
 
 def as_config(config: DetectorConfig | str | None) -> DetectorConfig:
@@ -169,6 +167,15 @@ class ReadSweep:
     def read_points(self) -> tuple[np.ndarray, np.ndarray | None]:
         """The points."""
         return self.xyz, self.intensity
+
+
+def dropped_points(sweep: Any) -> int:
+    """Points that a sweep was cut by before it came here; most kinds of sweeps know of none.
+
+    Args:
+      sweep: what has a name and `read_points`, and perhaps ``num_dropped``.
+    """
+    return getattr(sweep, "num_dropped", 0)
 
 
 def as_sweeps(sweeps: Iterable[Any], *, called: str) -> Iterator[Any]:

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from jaxbox.geometry.rigid import relative_rigid
-from jaxbox.run.arguments import ReadSweep
+from jaxbox.run.arguments import ReadSweep, dropped_points
 from jaxbox.run.streaming import ReadableSweep
 from jaxbox.tracking.odometry import KissIcp, ego_motion_from_boxes
 from jaxbox.tracking.poses import Poses, PoseSource, check_pose, deskew
@@ -112,7 +112,7 @@ class RegisteredPoints:
         self._T_world_sensor[index] = T_world_sensor
         if time_s is not None and before is not None:
             xyz = deskew(xyz, time_s, relative_rigid(before, T_world_sensor))
-        return ReadSweep(sweep.name, xyz, intensity, getattr(sweep, "num_dropped", 0))
+        return ReadSweep(sweep.name, xyz, intensity, dropped_points(sweep))
 
     def locate(self, index: int, detections: Detections) -> np.ndarray:
         """The pose that was found, which is then forgotten; of NaN where the registration failed."""
@@ -183,7 +183,7 @@ class Deskewed:
     @property
     def num_dropped(self) -> int:
         """As the sweep's."""
-        return getattr(self.sweep, "num_dropped", 0)
+        return dropped_points(self.sweep)
 
     def read_points(self) -> tuple[np.ndarray, np.ndarray | None]:
         """Reads the points and moves them."""

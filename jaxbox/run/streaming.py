@@ -15,7 +15,7 @@ from jaxbox._box import ByValue
 from jaxbox._padding import aligned_empty, checked_points, fill_rows, fitting_capacity
 from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.config.checks import check_config
-from jaxbox.run.arguments import as_config, as_key, as_sweeps
+from jaxbox.run.arguments import as_config, as_key, as_sweeps, dropped_points
 from jaxbox.run.batching import checked_devices, detect_on
 from jaxbox.run.processes import ProcessPool, WorkerDied, ahead
 from jaxbox.types import Detections, PointCloud
@@ -137,7 +137,7 @@ class _Buffer:
 def _read(sweep: ReadableSweep, buffer: _Buffer, capacity: int | None) -> PointCloud | str:
     """The padded sweep, or why there is none."""
     try:
-        return buffer.fill(*sweep.read_points(), capacity, getattr(sweep, "num_dropped", 0))
+        return buffer.fill(*sweep.read_points(), capacity, dropped_points(sweep))
     except Exception as error:
         # Whatever a reader may raise concerns its own sweep alone.
         return f"{type(error).__name__}: {error}"
