@@ -75,6 +75,30 @@ def test_a_seed_may_be_traced():
     assert as_key(key) is key
 
 
+@pytest.mark.parametrize(
+    "keys",
+    [
+        jax.random.split(jax.random.key(0), 3),
+        jax.random.split(jax.random.PRNGKey(0), 3),
+        jnp.arange(3),
+        np.arange(2),
+    ],
+)
+def test_several_keys_are_refused_and_vmap_takes_them_one_by_one(xyz, keys):
+    """They would be hashed into one key, and all sweeps read with it."""
+    with pytest.raises(ValueError, match=r"key holds several, of shape \([23],.*jax.vmap"):
+        jaxbox.detect(PointCloud.from_numpy(xyz), key=keys)
+    one_by_one = jax.vmap(as_key)(jnp.asarray(keys))
+    for row, key in enumerate(keys):
+        np.testing.assert_array_equal(jax.random.key_data(one_by_one[row]), jax.random.key_data(as_key(key)))
+
+
+def test_a_key_of_other_numbers_is_refused():
+    for key in (jnp.float32(0), np.zeros(2), True, "0"):
+        with pytest.raises(TypeError, match="give an integer, or a key from"):
+            as_key(key)
+
+
 def test_a_name_is_a_preset():
     for name, preset in DetectorConfig.presets().items():
         assert as_config(name) == preset

@@ -59,6 +59,7 @@ def as_key(key: Any) -> Any:
       The key.
 
     Raises:
+      ValueError: for several keys or seeds in one array.
       TypeError: for anything else.
     """
     if key is None:
@@ -67,8 +68,17 @@ def as_key(key: Any) -> Any:
         return _key_of(int(key))
     if isinstance(key, bool) or not hasattr(key, "dtype"):
         raise TypeError(f"key is {key!r}; give an integer, or a key from jax.random.key(0).")
-    is_seed = key.shape == () and jnp.issubdtype(key.dtype, jnp.integer)
-    return jax.random.key(key) if is_seed else key
+    is_typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    if not (is_typed or jnp.issubdtype(key.dtype, jnp.integer)):
+        raise TypeError(f"key has dtype {key.dtype}; give an integer, or a key from jax.random.key(0).")
+    # Of `jax.random.PRNGKey`, the keys before there was a type for them.
+    is_words = key.dtype == jnp.uint32 and key.ndim == 1
+    if key.ndim and not is_words:
+        raise ValueError(
+            f"key holds several, of shape {key.shape}, and one sweep takes one: a key for each of a batch "
+            "goes through jax.vmap(lambda cloud, key: jaxbox.detect(cloud, key=key))(clouds, keys)."
+        )
+    return key if is_typed or is_words else jax.random.key(key)
 
 
 @functools.lru_cache(maxsize=64)

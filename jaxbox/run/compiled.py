@@ -51,8 +51,8 @@ def detect(
       The detections, best score first. Whatever was dropped is in `status` and `counts`.
 
     Raises:
-      ValueError: for fields that contradict each other, a name that no preset has, or arrays of other shapes
-        than `PointCloud` says.
+      ValueError: for fields that contradict each other, a name that no preset has, several keys, or arrays of
+        other shapes than `PointCloud` says.
       TypeError: for anything but a cloud or array, a configuration or preset, and a key or seed.
 
     Status bits: all of `Status`; `Detections.raise_if_failed` turns those of full capacities into an error.
