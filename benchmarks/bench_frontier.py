@@ -61,11 +61,11 @@ def plot(table: Mapping[str, Mapping[str, float]], path: pathlib.Path) -> None:
     figure = Figure(figsize=(6, 4), layout="constrained")
     axes = figure.subplots()
     for name, row in table.items():
-        axes.errorbar(row["median ms"], row["SOFT"], yerr=row["SOFT sd"], fmt="o", capsize=3)
-        axes.annotate(name, (row["median ms"], row["SOFT"]), xytext=(8, 4), textcoords="offset points")
-    slowest = max(row["median ms"] for row in table.values())
-    # Room for the name of the slowest.
-    axes.set(xlabel="median time of a sweep (ms)", ylabel="SOFT", xlim=(0, 1.15 * slowest), ylim=(0, 100))
+        axes.errorbar(row["median ms"], row["SOFT"], yerr=row["SOFT sd"], fmt="o", capsize=3, label=name)
+    axes.set(xlabel="median time of a sweep (ms)", ylabel="SOFT", ylim=(0, 100))
+    axes.set_xlim(left=0)
+    # Names beside the points would lie on each other, and over the edge.
+    axes.legend(loc="lower right")
     axes.grid(alpha=0.3)
     save_figure(path, figure)
 
