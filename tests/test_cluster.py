@@ -442,6 +442,8 @@ def test_what_the_workers_cannot_do_is_refused(tmp_path):
         assert expected in result.stderr
     with pytest.raises(ValueError, match="sweeps_per_partition is 0"):
         detect_dataset(tmp_path, tmp_path / "out", sweeps_per_partition=0)
+    with pytest.raises(ValueError, match="'fats' is not a preset"):
+        detect_dataset(tmp_path, tmp_path / "out", "fats")
 
 
 # --- drives ---------------------------------------------------------------------------------------
@@ -505,8 +507,8 @@ def partitions_of(task, *given):
 
 
 def test_sweeps_are_grouped_by_drive_as_one_process_groups_them(drives, tmp_path):
-    write_foxglove(tmp_path / "plain.mcap", ["/front"])
-    given = [*sources_of(drives), str(tmp_path / "plain.mcap")]
+    write_foxglove(tmp_path / "00.mcap", ["/front"])
+    given = [*sources_of(drives), str(tmp_path / "00.mcap")]
     expected = io.group_sequences(io.open_sweeps(given))
     found = group_refs(list_sweeps(given, None, serially))
     assert [name for name, _ in found] == [name for name, _ in expected]
@@ -711,6 +713,10 @@ def test_what_the_workers_cannot_do_for_drives_is_refused(drives, tmp_path):
         track_dataset(drives / "plain", tmp_path / "out", max_tracks=0)
     with pytest.raises(ValueError, match="rate_hz is 0"):
         track_dataset(drives / "plain", tmp_path / "out", rate_hz=0)
+    with pytest.raises(ValueError, match="gate is -1"):
+        track_dataset(drives / "plain", tmp_path / "out", track_config=TrackConfig(gate=-1))
+    with pytest.raises(ValueError, match="'fats' is not a preset"):
+        track_dataset(drives / "plain", tmp_path / "out", "fats")
 
 
 # --- errors ---------------------------------------------------------------------------------------

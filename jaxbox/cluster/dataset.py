@@ -12,6 +12,7 @@ from jaxbox.cluster.run import Run, absolute, check_counts, joined_ray
 from jaxbox.cluster.sources import SweepRef, listed
 from jaxbox.config import DetectorConfig
 from jaxbox.config.checks import check_config
+from jaxbox.run.arguments import as_config
 from jaxbox.run.cache import CacheFolders
 from jaxbox.run.versions import versions
 
@@ -22,7 +23,7 @@ SWEEPS_PER_PARTITION = 256
 def detect_dataset(
     sources: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     output: str | os.PathLike[str],
-    config: DetectorConfig | None = None,
+    config: DetectorConfig | str | None = None,
     *,
     address: str | None = None,
     workers: int | None = None,
@@ -46,7 +47,7 @@ def detect_dataset(
       sources: local paths as `jaxbox.io.open_sweeps` takes them (on a cluster, on a disk that all nodes
         have), and URLs that fsspec knows, of point files, or of folders or patterns of them.
       output: a folder, local or a URL.
-      config: the settings of all; None for the default preset.
+      config: the settings of all, or the name of a preset; None for the default preset.
       address: of a running cluster, as `ray.init` takes it; None to use the one that this process has
         joined already, or else to start one on this machine, and to end it again.
       workers: processes that detect; None for as many as there are cores.
@@ -74,7 +75,7 @@ def detect_dataset(
         workers=workers,
         batch=batch,
     )
-    config = DetectorConfig() if config is None else config
+    config = as_config(config)
     check_config(config)
     task = DetectTask(
         output=absolute(output),

@@ -11,8 +11,9 @@ from jaxbox.cluster.run import Run, absolute, check_counts, joined_ray
 from jaxbox.cluster.sources import group_refs, is_remote, listed
 from jaxbox.cluster.track_worker import TrackTask, TrackWorker
 from jaxbox.config import DetectorConfig, TrackConfig
-from jaxbox.config.checks import check_config
+from jaxbox.config.checks import check_config, check_ranges
 from jaxbox.io.poses import AUTO
+from jaxbox.run.arguments import as_config
 from jaxbox.run.cache import CacheFolders
 from jaxbox.run.pose_providers import ESTIMATED, Clock, estimated_source, make_pose_provider
 from jaxbox.run.tracking import MAX_TRACKS, RATE_HZ
@@ -22,7 +23,7 @@ from jaxbox.run.versions import versions
 def track_dataset(
     sources: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     output: str | os.PathLike[str],
-    config: DetectorConfig | None = None,
+    config: DetectorConfig | str | None = None,
     track_config: TrackConfig | None = None,
     *,
     poses: str | os.PathLike[str] = AUTO,
@@ -49,7 +50,7 @@ def track_dataset(
     Args:
       sources: as `detect_dataset`. A recording is a drive, and so are the point files of a folder.
       output: a folder, local or a URL.
-      config: the detector's settings; None for the default preset.
+      config: the detector's settings, or the name of a preset; None for the default preset.
       track_config: the tracker's settings; None for the defaults.
       poses: "auto" for what the data set or recording holds, else kiss-icp (extra ``track``) where this
         process has it, else the boxes; "kiss-icp", "boxes" or "none"; or a file, or a folder with one a
@@ -82,13 +83,15 @@ def track_dataset(
     check_counts(cpus_per_worker=cpus_per_worker, workers=workers, max_tracks=max_tracks)
     # It refuses a rate that is not positive.
     Clock(rate_hz, None)
-    config = DetectorConfig() if config is None else config
+    config = as_config(config)
     check_config(config)
+    track_config = TrackConfig() if track_config is None else track_config
+    check_ranges(track_config)
     given = listed(sources)
     task = TrackTask(
         output=absolute(output),
         config=jax.tree.map(float, config),
-        track_config=jax.tree.map(float, TrackConfig() if track_config is None else track_config),
+        track_config=jax.tree.map(float, track_config),
         poses=_checked_poses(os.fspath(poses), given),
         estimator=estimated_source(),
         rate_hz=rate_hz,

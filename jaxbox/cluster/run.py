@@ -160,13 +160,6 @@ class Run(Generic[AnyReport]):
     cpus_per_worker: int = 1
     """Cores of each worker."""
 
-    """One call of `detect_dataset`."""
-
-    task: Task
-    inputs: list[str]
-    ray: Any
-    cpus_per_worker: int
-
     def __post_init__(self) -> None:
         self._store = Store(self.task.output)
         self._options = self.task.options
