@@ -571,6 +571,25 @@ def test_recordings_and_files_are_taken_one_after_the_other(tmp_path):
     assert sweeps[-1].name == names[-1]
 
 
+def test_no_two_sweeps_share_their_results_where_recordings_are_among_them(tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        write_mcap(tmp_path / folder / "x.mcap", ["/points"])
+        np.save(tmp_path / folder / "1.npy", XYZ)
+    recording = tmp_path / "a" / "x.mcap"
+    files = [tmp_path / folder / "1.npy" for folder in ("a", "b")]
+    names = ["a_1", "x_000000", "x_000001", "x_000002", "b_1"]
+    assert [sweep.name for sweep in io.open_sweeps([files[0], recording, files[1]])] == names
+    np.save(tmp_path / "x_000002.npy", XYZ)
+    for other, name in ((tmp_path / "b" / "x.mcap", "x_000000"), (tmp_path / "x_000002.npy", "x_000002")):
+        with pytest.raises(
+            io.InputError, match=f"would be named {name}, as that of .*Rename one, or go over"
+        ):
+            io.open_sweeps([recording, other])
+    with pytest.raises(io.InputError, match=r"x\.mcap: given twice"):
+        io.open_sweeps([recording, recording])
+
+
 def test_a_raw_drive_has_the_times_of_its_file(tmp_path):
     data = tmp_path / "2011_09_26" / "drive" / "velodyne_points" / "data"
     data.mkdir(parents=True)

@@ -104,8 +104,7 @@ def _list_local(paths: list[str], topic: str | None) -> list[SweepRef]:
     refs = []
     for part in getattr(found, "parts", (found,)):
         if isinstance(part, io.RecordedSweeps):
-            names = (f"{part.path.stem}_{index:06d}" for index in range(len(part)))
-            refs += [SweepRef(name, str(part.path), index) for index, name in enumerate(names)]
+            refs += [SweepRef(part.name_of(index), str(part.path), index) for index in range(len(part))]
         else:
             refs += [SweepRef(sweep.name, str(sweep.points_path)) for sweep in part]
     return refs
@@ -180,7 +179,7 @@ def group_refs(refs: Sequence[SweepRef]) -> list[tuple[str, tuple[SweepRef, ...]
     [('day', 1)]
     """
     sweeps = [listed_sweep(ref) for ref in refs]
-    # Where there are recordings too, files of different folders may have one name.
+    # The messages of a recording share its path.
     refs_of = {(sweep.points_path, sweep.name): ref for sweep, ref in zip(sweeps, refs, strict=True)}
     groups = io.group_sequences(sweeps)
     return [(name, tuple(refs_of[item.points_path, item.name] for item in group)) for name, group in groups]
@@ -239,7 +238,7 @@ def _distinct(refs: list[SweepRef]) -> list[SweepRef]:
         if ref.name in first:
             raise io.InputError(
                 f"{ref.url}: its sweep would be named {ref.name}, as that of {first[ref.name]}. "
-                "Go over the two one after the other, with an output of its own each."
+                "Rename one, or go over the two one after the other, with an output of its own each."
             )
         first[ref.name] = ref.url
     return named

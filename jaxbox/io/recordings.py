@@ -76,12 +76,15 @@ class RecordedSweeps(Sequence[Sweep]):
         """Messages of the topic, by the recording's index."""
         return self._count
 
+    def name_of(self, index: int) -> str:
+        """The name of a sweep: its number behind that of the recording."""
+        return f"{self.path.stem}_{index:06d}"
+
     def __iter__(self) -> Iterator[Sweep]:
         """One pass over the recording."""
         for index, (timestamp_ns, decode) in enumerate(self._messages()):
-            name = f"{self.path.stem}_{index:06d}"
             yield Sweep(
-                name,
+                self.name_of(index),
                 self.path,
                 timestamp_ns=timestamp_ns,
                 sequence=self.path.stem,

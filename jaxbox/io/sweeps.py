@@ -25,7 +25,7 @@ import glob
 import itertools
 import os
 import pathlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import overload
 
 from jaxbox._files import InputError, check_file, read_text
@@ -95,11 +95,16 @@ def open_sweeps(
     paths = [path] if isinstance(path, str | os.PathLike) else list(path)
     if not paths:
         raise InputError("no path was given; name at least one file or folder.")
-    parts = [part for item in paths for found in _expand(item) for part in _open_path(found, topic)]
+    parts = [part for item in paths for found in expand(item) for part in _open_path(found, topic)]
     if convention != ORDINARY:
         parts = [_taken_as(part, convention) for part in parts]
+    files = _distinct([sweep for part in parts if isinstance(part, tuple) for sweep in part])
     if all(isinstance(part, tuple) for part in parts):
-        return _distinct([sweep for part in parts for sweep in part])
+        return files
+    renamed = iter(files)
+    parts = [
+        tuple(itertools.islice(renamed, len(part))) if isinstance(part, tuple) else part for part in parts
+    ]
     return parts[0] if len(parts) == 1 else ChainedSweeps(parts)
 
 
@@ -125,8 +130,18 @@ def sweep_of(file: pathlib.Path) -> Sweep:
     return _sweep_at(file)
 
 
-def _expand(path: PathLike) -> list[pathlib.Path]:
-    """The paths that a pattern matches, or the path itself."""
+def expand(path: PathLike) -> list[pathlib.Path]:
+    """The paths that a pattern matches, or the path itself.
+
+    Args:
+      path: as `open_sweeps` takes it.
+
+    Returns:
+      Absolute, sorted.
+
+    Raises:
+      InputError: for a pattern that nothing matches.
+    """
     # Not `resolve`: datasets are often put together from links, and the layout is in the links' names.
     text = os.path.abspath(path)
     if os.path.exists(text) or not glob.has_magic(text):
@@ -183,7 +198,7 @@ def _distinct(sweeps: list[Sweep]) -> tuple[Sweep, ...]:
     """The sweeps; where several have one name, as in different folders, these stand before it."""
     paths = [sweep.points_path for sweep in sweeps]
     names = distinct_names([(path.parent, sweep.name) for path, sweep in zip(paths, sweeps, strict=True)])
-    _check_distinct(names, paths)
+    _check_distinct(zip(names, paths, strict=True))
     return tuple(dataclasses.replace(sweep, name=name) for sweep, name in zip(sweeps, names, strict=True))
 
 
@@ -211,25 +226,32 @@ def distinct_names(places: Sequence[tuple[pathlib.PurePath, str]]) -> list[str]:
     return names
 
 
-def _check_distinct(names: Sequence[str], paths: Sequence[pathlib.Path]) -> None:
+def _check_distinct(places: Iterable[tuple[str, pathlib.Path]]) -> None:
+    """Refuses two sweeps of one name, by the name and file of each."""
     first: dict[str, pathlib.Path] = {}
-    for name, path in zip(names, paths, strict=True):
+    for name, path in places:
         if path == first.get(name):
             raise InputError(f"{path}: given twice, by itself or by a folder that holds it; name it once.")
         if name in first:
             raise InputError(
                 f"{path}: its sweep would be named {name}, as that of {first[name]}, and share its results. "
-                "Open the two one after the other."
+                "Rename one, or go over the two one after the other, with an output of its own each."
             )
         first[name] = path
+
+
+def _names_in(part: Sequence[Sweep]) -> Iterator[tuple[str, pathlib.Path]]:
+    """Name and file of each sweep that is known without reading one."""
+    if isinstance(part, RecordedSweeps):
+        return ((part.name_of(index), part.path) for index in range(len(part)))
+    return ((sweep.name, sweep.points_path) for sweep in (part if isinstance(part, tuple) else ()))
 
 
 class ChainedSweeps(Sequence[Sweep]):
     """Several recordings, or recordings and files, one after the other."""
 
     def __init__(self, parts: Sequence[Sequence[Sweep]]) -> None:
-        recordings = [part.path for part in parts if isinstance(part, RecordedSweeps)]
-        _check_distinct([path.stem for path in recordings], recordings)
+        _check_distinct([named for part in parts for named in _names_in(part)])
         self.parts = parts
         """The recordings, and the files as tuples."""
         self._ends = list(itertools.accumulate(len(part) for part in parts))
