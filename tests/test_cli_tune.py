@@ -191,9 +191,25 @@ def test_frames_of_one_name_have_the_drives_of_their_folders(kitti_folder, tmp_p
     given.write_text("".join(f"{name} {drive}\n" for name, drive in zip(pooled, "aba", strict=True)))
     groups = frame_groups(sweeps, pooled, drive_files(folders, given))
     assert groups == ("drive", dict(zip(pooled, "aba", strict=True)))
+    mixed = dict(zip(folders, (given, None), strict=True))
+    given.write_text("000000 a\n")
+    assert frame_groups(sweeps, pooled, mixed) == (
+        "drive",
+        dict(zip(pooled, ["a", *["training"] * 2], strict=True)),
+    )
     kind, groups = frame_groups(sweeps, pooled, dict.fromkeys(folders))
     assert kind == "folder"
     assert groups[pooled[0]] != groups[pooled[1]] == groups[pooled[2]]
+
+
+def test_folders_are_listed_once_however_many_files_say_their_drives(kitti_folder, tmp_path, monkeypatch):
+    for folder in ("one", "two"):
+        copy_sweeps(kitti_folder, tmp_path / folder, ["000000"], ["000000"])
+    folders = [tmp_path / "one", tmp_path / "two"]
+    sweeps = open_sweeps(folders)
+    monkeypatch.setattr("pathlib.Path.iterdir", None)
+    _, groups = frame_groups(sweeps, [sweep.name for sweep in sweeps], drive_files(folders, None))
+    assert list(groups.values()) == ["drive_one", "drive_two"]
 
 
 def interrupt_at(monkeypatch, index):
@@ -235,6 +251,8 @@ def test_interrupted_before_the_base_is_scored_it_writes_nothing(kitti_folder, t
         (("--search", "box.num_angles=10:90"), "box.num_angles is static"),
         (("--search", "vehicles.ring_wieght=1:2"), "nearest traced settings: vehicles.ring_weight"),
         (("--search", "vehicles.ring_m=1:2", "--search", "vehicles.ring_m=1:3"), "stands there twice"),
+        (("--search", "vehicles.max_overlap=0.5:1.5"), "vehicles.max_overlap is 1.5; it must be"),
+        (("--trials", "5", "--refine", "5"), "--refine 5: these are among the --trials 5"),
         (("--objective", "f1"), "choose one of soft, 3d, bev"),
         (("--drives", "nowhere.txt"), "nowhere.txt"),
         (("--copies", "99"), "copies"),

@@ -190,3 +190,19 @@ def test_the_default_space_is_of_traced_settings_round_the_base(name):
 def test_a_range_that_cannot_be_searched_is_refused(text, expected):
     with pytest.raises(ValueError, match=expected):
         parse_axis(DetectorConfig(), text)
+
+
+def test_the_default_space_stays_within_what_settings_take_and_leaves_out_what_is_off():
+    changes = {"completion.near_weight": 0, "vehicles.objective_gate": -1, "vehicles.max_overlap": 0.9}
+    base = replace_fields(DetectorConfig(), changes)
+    axes = {axis.name: axis for axis in default_axes(base)}
+    off = {"completion.near_weight", "vehicles.objective_gate"}
+    assert {axis.name for axis in default_axes(DetectorConfig())} - set(axes) == off
+    assert axes["vehicles.max_overlap"].high == 1
+    for changed in latin_hypercube(list(axes.values()), 20, seed=0):
+        replace_fields(base, changed)
+
+
+def test_a_range_beyond_what_a_setting_takes_is_refused_before_any_trial():
+    with pytest.raises(ValueError, match=r"vehicles.max_overlap is -1.0; it must be .* from 0 to 1"):
+        parse_axis(DetectorConfig(), "vehicles.max_overlap=-1:0.5")

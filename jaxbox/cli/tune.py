@@ -29,6 +29,7 @@ from jaxbox.io import (
     open_sweeps,
     read_drives,
 )
+from jaxbox.io.sweeps import distinct_names, expand, sweep_of
 from jaxbox.run.compiled import count_compilations
 from jaxbox.tuning import Axis, Bench, Trial
 
@@ -77,6 +78,7 @@ def run_tune(labels: Sequence[pathlib.Path], options: TuneOptions, console: Cons
     Raises:
       InputError: where labels or options cannot be used.
     """
+    check_trials(options)
     axes = chosen_axes(options)
     drives = drive_files(labels, options.drives)
     bench = make_bench(labels, options, drives)
@@ -84,22 +86,7 @@ def run_tune(labels: Sequence[pathlib.Path], options: TuneOptions, console: Cons
     compiled_before = count_compilations()
     console.print(f"compiling the detector for {bench.capacity} points")
     compile_s = bench.warm_up()
-    trials: list[Trial] = []
-    interrupted = False
-    with make_progress(shown=True) as progress:
-        task = progress.add_task("tuning", total=options.trials * bench.sweeps_per_trial)
-        try:
-            for trial in run_trials(bench, axes, options, lambda: progress.advance(task)):
-                trials.append(trial)
-                write_trials(options.output / "trials.csv", bench, axes, trials)
-                best = tuning.best_trial(trials)
-                console.print(
-                    f"trial {trial.index} of {options.trials - 1}: {trial.mean:.2f}, {trial.seconds:.1f} s; "
-                    f"best {best.mean:.2f}, trial {best.index}; {time_left(trials, options.trials)} left"
-                )
-        except KeyboardInterrupt:
-            heard()
-            interrupted = True
+    trials, interrupted = try_settings(bench, axes, options, console)
     if not trials:
         print_error("interrupted before the base was scored; there is nothing to report.")
         return ExitCode.INTERRUPTED
@@ -116,6 +103,51 @@ def run_tune(labels: Sequence[pathlib.Path], options: TuneOptions, console: Cons
     }
     write_report(report, options, console)
     return exit_code(failed=False, interrupted=interrupted)
+
+
+def try_settings(
+    bench: Bench, axes: Sequence[Axis], options: TuneOptions, console: Console
+) -> tuple[list[Trial], bool]:
+    """Runs the trials, says how each went, and writes trials.csv anew after each.
+
+    Args:
+      bench: what they are tried on.
+      axes: the space.
+      options: the command's options.
+      console: where the lines go.
+
+    Returns:
+      The trials that are done, and whether it was interrupted.
+    """
+    trials: list[Trial] = []
+    with make_progress(shown=True) as progress:
+        task = progress.add_task("tuning", total=options.trials * bench.sweeps_per_trial)
+        try:
+            for trial in run_trials(bench, axes, options, lambda: progress.advance(task)):
+                trials.append(trial)
+                write_trials(options.output / "trials.csv", bench, axes, trials)
+                best = tuning.best_trial(trials)
+                console.print(
+                    f"trial {trial.index} of {options.trials - 1}: {trial.mean:.2f}, {trial.seconds:.1f} s; "
+                    f"best {best.mean:.2f}, trial {best.index}; {time_left(trials, options.trials)} left"
+                )
+        except KeyboardInterrupt:
+            heard()
+            return trials, True
+    return trials, False
+
+
+def check_trials(options: TuneOptions) -> None:
+    """Refuses more steps round the best than there are trials besides the base.
+
+    Raises:
+      InputError: naming how many trials they take.
+    """
+    if 0 < options.refine >= options.trials:
+        raise InputError(
+            f"--refine {options.refine}: these are among the --trials {options.trials}, the first of which "
+            f"is the base; give at least --trials {options.refine + 1}, or fewer steps."
+        )
 
 
 def time_left(trials: Sequence[Trial], planned: int) -> str:
@@ -210,28 +242,35 @@ def frame_groups(
     Raises:
       InputError: where a folder has a file and one of its frames has no drive in it.
     """
-    paths = {sweep.name: sweep.points_path for sweep in sweeps}
+    path_of = {sweep.name: sweep.points_path for sweep in sweeps}
     if any(drives.values()):
-        labelled = {paths[name] for name in names}
+        labelled = {path_of[name] for name in names}
         drive_of: dict[pathlib.Path, str] = {}
         for file in dict.fromkeys(drives.values()):
-            folders = [folder for folder in drives if drives[folder] == file]
-            # A file names its sweeps as they are called without those of the others.
-            found = sweeps if len(folders) == len(drives) else open_sweeps(folders)
+            found = _sweeps_below(sweeps, [folder for folder in drives if drives[folder] == file])
             drive_of |= _folder_groups(found) if file is None else _drives_in(file, found, labelled)
-        return "drive", {name: drive_of[paths[name]] for name in names}
+        return "drive", {name: drive_of[path_of[name]] for name in names}
     folder_of = _folder_groups(sweeps)
-    folders = {name: folder_of[paths[name]] for name in names}
+    folders = {name: folder_of[path_of[name]] for name in names}
     if len(set(folders.values())) > 1:
         return "folder", folders
     return "sweep", {name: name for name in names}
 
 
+def _sweeps_below(sweeps: Sequence[Sweep], folders: Sequence[pathlib.Path]) -> list[Sweep]:
+    """Those whose points lie in the folders; recordings have no labels, and are none of them."""
+    roots = {root for folder in folders for root in expand(folder)}
+    files = [sweep for sweep in sweeps if sweep.decode is None]
+    return [s for s in files if not roots.isdisjoint((s.points_path, *s.points_path.parents))]
+
+
 def _drives_in(
     file: pathlib.Path, sweeps: Sequence[Sweep], labelled: Collection[pathlib.Path]
 ) -> dict[pathlib.Path, str]:
-    """The drive of each labelled sweep; the file names them as these sweeps are named."""
-    path_of = {sweep.name: sweep.points_path for sweep in sweeps if sweep.points_path in labelled}
+    """The drive of each labelled sweep; the file names these sweeps as if there were no others."""
+    paths = [sweep.points_path for sweep in sweeps]
+    names = distinct_names([(path.parent, sweep_of(path).name) for path in paths])
+    path_of = {name: path for name, path in zip(names, paths, strict=True) if path in labelled}
     return {path_of[name]: drive for name, drive in read_drives(file, path_of).items()}
 
 
@@ -256,13 +295,12 @@ def run_trials(
     """
     best = bench.run(0, {}, blind=True, on_sweep=on_sweep)
     yield best
-    refined = min(options.refine, options.trials - 1)
-    spread = tuning.latin_hypercube(axes, options.trials - 1 - refined, seed=options.seed)
+    spread = tuning.latin_hypercube(axes, options.trials - 1 - options.refine, seed=options.seed)
     for index, changes in enumerate(spread, 1):
         trial = bench.run(index, changes, blind=True, on_sweep=on_sweep)
         best = tuning.best_trial([best, trial])
         yield trial
-    if not refined:
+    if not options.refine:
         return
     values = tuning.axis_values(bench.base, axes) | dict(best.changes)
     steps = tuning.refine(axes, values, best.mean)

@@ -7,7 +7,8 @@ from collections.abc import Generator, Mapping, Sequence
 import numpy as np
 
 from jaxbox.config import DetectorConfig
-from jaxbox.config.fields import check_traced, traced_fields
+from jaxbox.config.fields import check_traced, traced_fields, traced_ranges
+from jaxbox.config.ranges import checked_number
 
 Changes = Mapping[str, float]
 """Thresholds by dotted name that differ from the base."""
@@ -80,7 +81,8 @@ def parse_axis(config: DetectorConfig, text: str) -> Axis:
       The axis.
 
     Raises:
-      ValueError: for another form, a field that is static or unknown, or an empty range.
+      ValueError: for another form, a field that is static or unknown, an empty range, or one with numbers
+        that the field does not take.
 
     >>> parse_axis(DetectorConfig(), "vehicles.ring_weight=2:16:log")
     Axis(name='vehicles.ring_weight', low=2.0, high=16.0, log=True)
@@ -99,15 +101,27 @@ def parse_axis(config: DetectorConfig, text: str) -> Axis:
         raise ValueError(f"{text}: the range is empty; LOW must be below HIGH, both finite.")
     if scale and low <= 0:
         raise ValueError(f"{text}: a log scale needs LOW above 0.")
+    allowed = traced_ranges(config)[name]
+    for end in (low, high):
+        checked_number(name, end, allowed)
     return Axis(name, low, high, log=bool(scale))
 
 
 def default_axes(config: DetectorConfig) -> list[Axis]:
-    """The default space round a base; see `DEFAULT_RATIOS`."""
-    values = traced_fields(config)
+    """The default space round a base; see `DEFAULT_RATIOS`.
+
+    Args:
+      config: the base.
+
+    Returns:
+      The axes, within what each setting takes; without those that the base switched off with 0, or a gate
+      that it opened with -1: ratios lead nowhere from there.
+    """
+    values, ranges = traced_fields(config), traced_ranges(config)
     return [
-        Axis(name, float(values[name]) / ratio, float(values[name]) * ratio, log=True)
+        Axis(name, value / ratio, min(value * ratio, ranges[name].maximum), log=True)
         for name, ratio in DEFAULT_RATIOS.items()
+        if (value := float(values[name])) > 0
     ]
 
 
