@@ -759,5 +759,24 @@ def test_the_report_counts_lost_partitions_among_the_failures():
     report = DatasetReport(partitions=[done, lost])
     assert report.failures == [{"sweep": "part-000001", "url": "", "reason": "OSError: full"}]
     assert (report.num_done, report.deaths) == (2, {"part-000000": 2})
+    # Each of its sweeps is missing, and not one.
+    assert (report.num_failed, report.summary()["num_failed"]) == (2, 2)
+
+
+def test_what_became_of_the_poses_of_a_drive_is_said(monkeypatch, tmp_path):
+    note = "Poses are estimated: those next to points at a URL are not fetched."
+    part = DriveReport(name="drive", key="", num_sweeps=1, status={"a": 0}, notes=[note])
+
+    def track_all(*_, on_report, **__):
+        on_report(part, 1)
+        return DatasetReport(partitions=[part])
+
+    monkeypatch.setattr("jaxbox.cli.track_ray.track_dataset", track_all)
+    result = run("track", tmp_path, "--output", tmp_path / "out", "--engine", "ray")
+    assert result.exit_code == 0, result.output
+    assert f"drive: {note}" in result.stdout.splitlines()
+
+
+def test_what_is_no_report_of_a_partition_is_refused():
     with pytest.raises(ValueError, match="not the report"):
         PartitionReport.from_json('{"name": "a"}')

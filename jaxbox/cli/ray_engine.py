@@ -157,6 +157,8 @@ def _tell(part: PartitionReport, options: RayOptions) -> None:
             f"{part.seconds:.1f} s",
             markup=False,
         )
+        for note in part.notes if isinstance(part, DriveReport) else ():
+            stdout().print(f"{part.name}: {note}", markup=False)
 
 
 def _found(part: PartitionReport) -> str:
@@ -181,7 +183,7 @@ def _tell_end(report: DatasetReport[Any], options: RayOptions) -> None:
         num_done = report.num_done - report.num_done_before
         rate = num_done / max(report.elapsed_s, 1e-9)
         before = f", {report.num_done_before} done before" if report.num_skipped else ""
-        stdout().print(f"{num_done} sweeps done, {len(report.failures)} failed{before}", markup=False)
+        stdout().print(f"{num_done} sweeps done, {report.num_failed} failed{before}", markup=False)
         stdout().print(
             f"{report.num_boxes} boxes in {len(report.partitions)} partitions by {report.workers} workers, "
             f"{report.elapsed_s:.1f} s in all with starting and compiling, {rate:.1f} sweeps a second",

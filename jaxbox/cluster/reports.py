@@ -114,6 +114,11 @@ class DatasetReport(Generic[AnyReport]):
         return sum(part.num_done for part in self.partitions)
 
     @property
+    def num_failed(self) -> int:
+        """Sweeps without a result: also those of a lost partition, and behind where a recording breaks."""
+        return sum(part.num_sweeps - part.num_done for part in self.partitions)
+
+    @property
     def num_boxes(self) -> int:
         """Boxes in the files."""
         return sum(part.num_boxes for part in self.partitions)
@@ -139,7 +144,7 @@ class DatasetReport(Generic[AnyReport]):
             "num_skipped": self.num_skipped,
             "num_done": self.num_done,
             "num_done_before": self.num_done_before,
-            "num_failed": sum(len(part.failures) for part in self.partitions),
+            "num_failed": self.num_failed,
             "num_boxes": self.num_boxes,
             "workers": self.workers,
             "elapsed_s": round(self.elapsed_s, 3),
