@@ -12,12 +12,11 @@ from rich.text import Text
 
 from jaxbox import io
 from jaxbox._interrupts import heard, stoppable
-from jaxbox._loopback import LOOPBACK_NAMES
 from jaxbox.cli.console import ExitCode, exit_code, print_warning, printable, stderr, stdout
 from jaxbox.cli.inputs import print_json
 from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
 from jaxbox.cli.report import SHOWN_MIN_SCORE
-from jaxbox.cli.view import initial_wish
+from jaxbox.cli.view import initial_wish, warn_of_watchers
 from jaxbox.geometry.mounting import Mounting
 from jaxbox.io.results import SweepResult
 from jaxbox.live import Latencies, LiveConfig, LiveResult, LiveRun, RecordedSource, Source
@@ -181,11 +180,8 @@ def _warn_of_others(source: Source, options: LiveOptions) -> None:
     """Says who else can send, and who can see."""
     if source.is_open:
         print_warning(f"whoever reaches {source.name} can send points; ?from=ADDRESS names the sensor.")
-    if options.host not in LOOPBACK_NAMES and (options.foxglove_port, options.page_port) != (None, None):
-        print_warning(
-            f"at {options.host} everybody who can reach this machine sees the sweeps; docs/viewer.md tells "
-            "how to forward a port instead."
-        )
+    if (options.foxglove_port, options.page_port) != (None, None):
+        warn_of_watchers(options.host)
 
 
 def _tell(sentence: str) -> None:

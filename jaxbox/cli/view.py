@@ -13,7 +13,7 @@ from jaxbox._interrupts import heard, stoppable
 from jaxbox._loopback import LOOPBACK_NAMES
 from jaxbox.cli.box_filter import EVERY_BOX, BoxFilter
 from jaxbox.cli.config_options import chosen_config
-from jaxbox.cli.console import ExitCode, stderr
+from jaxbox.cli.console import ExitCode, print_warning, stderr
 from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
 from jaxbox.config import DetectorConfig
 from jaxbox.viewer import Comparison, View, Wanted, open_viewer
@@ -172,14 +172,22 @@ def initial_wish(config: DetectorConfig, *, min_score: float, track: bool = Fals
     return Wanted(preset=None, given=config, view=view)
 
 
+def warn_of_watchers(host: str) -> None:
+    """Says who can see what is served at an address, where that is not this machine alone.
+
+    Args:
+      host: that a server listens at.
+    """
+    if host not in LOOPBACK_NAMES:
+        print_warning(
+            f"at {host} everybody who can reach this machine sees the sweeps; docs/viewer.md tells how to "
+            "forward a port instead."
+        )
+
+
 def _announce(url: str, options: ViewOptions, num_sweeps: int, console: Console) -> None:
     noun = "sweep" if num_sweeps == 1 else "sweeps"
     console.print(f"{num_sweeps} {noun} at {url} (Ctrl-C ends it)", markup=False)
-    if options.host not in LOOPBACK_NAMES:
-        stderr().print(
-            f"warning: at {options.host} everybody who can reach this machine sees the sweeps; "
-            "docs/viewer.md tells how to forward a port instead.",
-            markup=False,
-        )
+    warn_of_watchers(options.host)
     if options.open_browser:
         webbrowser.open(url)

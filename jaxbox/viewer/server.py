@@ -112,8 +112,8 @@ def _bind_error(family: int, address: Any) -> OSError | None:
 
 def _address_error(host: str, port: int, error: Exception) -> InputError:
     return InputError(
-        f"cannot listen at {host}, port {port} ({error}); choose another --port (0 takes a free one), "
-        "or a --host of this machine."
+        f"cannot listen at {host}, port {port} ({error}); choose another --port, of jaxbox live --view-port "
+        "(0 takes a free one), or a --host of this machine."
     )
 
 
