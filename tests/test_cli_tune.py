@@ -212,6 +212,14 @@ def test_folders_are_listed_once_however_many_files_say_their_drives(kitti_folde
     assert list(groups.values()) == ["drive_one", "drive_two"]
 
 
+def test_the_drives_beside_the_folders_of_a_pattern_are_found(tmp_path):
+    for folder in ("one", "two"):
+        (tmp_path / folder / "training").mkdir(parents=True)
+        (tmp_path / folder / "drives.txt").touch()
+    files = drive_files([tmp_path / "*" / "training"], None)
+    assert files == {tmp_path / name / "training": tmp_path / name / "drives.txt" for name in ("one", "two")}
+
+
 def interrupt_at(monkeypatch, index):
     run = Bench.run
 

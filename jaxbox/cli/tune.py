@@ -6,7 +6,7 @@ import datetime
 import json
 import pathlib
 import statistics
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -15,6 +15,7 @@ from jaxbox import tuning
 from jaxbox._interrupts import heard
 from jaxbox.cli.console import ExitCode, exit_code, make_progress, print_error
 from jaxbox.cli.report import make_table
+from jaxbox.cli.results import written
 from jaxbox.config import DetectorConfig
 from jaxbox.config.fields import PRESET_KEY, changed_fields
 from jaxbox.evaluation.copies import COPIES, labelled_frames
@@ -82,7 +83,8 @@ def run_tune(labels: Sequence[pathlib.Path], options: TuneOptions, console: Cons
     axes = chosen_axes(options)
     drives = drive_files(labels, options.drives)
     bench = make_bench(labels, options, drives)
-    options.output.mkdir(parents=True, exist_ok=True)
+    with written(options.output, advice="or choose another --output."):
+        options.output.mkdir(parents=True, exist_ok=True)
     compiled_before = count_compilations()
     console.print(f"compiling the detector for {bench.capacity} points")
     compile_s = bench.warm_up()
@@ -214,13 +216,16 @@ def drive_files(
     """The file that says which drive a frame is of, for each folder.
 
     Args:
-      labels: folders of labelled sweeps.
+      labels: folders of labelled sweeps, or patterns of them.
       given: the file that the user named, for all of them; or None.
 
     Returns:
-      That file; else the ``drives.txt`` in or beside the folder, None where there is none.
+      That file; else the ``drives.txt`` in or beside the folder, None where there is none. By absolute path.
+
+    Raises:
+      InputError: for a pattern that nothing matches.
     """
-    return {folder: given or find_drives(folder) for folder in labels}
+    return {folder: given or find_drives(folder) for label in labels for folder in expand(label)}
 
 
 def frame_groups(
@@ -257,9 +262,9 @@ def frame_groups(
     return "sweep", {name: name for name in names}
 
 
-def _sweeps_below(sweeps: Sequence[Sweep], folders: Sequence[pathlib.Path]) -> list[Sweep]:
+def _sweeps_below(sweeps: Sequence[Sweep], folders: Iterable[pathlib.Path]) -> list[Sweep]:
     """Those whose points lie in the folders; recordings have no labels, and are none of them."""
-    roots = {root for folder in folders for root in expand(folder)}
+    roots = set(folders)
     files = [sweep for sweep in sweeps if sweep.decode is None]
     return [s for s in files if not roots.isdisjoint((s.points_path, *s.points_path.parents))]
 
