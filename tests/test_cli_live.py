@@ -55,7 +55,7 @@ def test_a_broken_sweep_is_reported_and_the_exit_code_is_1(drive, tmp_path):
     result = run("live", tmp_path, *SLOWLY, "--no-track")
     assert result.exit_code == 1
     assert "000001.bin: 7 bytes" in result.stderr
-    assert "1 sweeps, 0 skipped, 1 faults" in result.stdout
+    assert "1 sweep, 0 skipped, 1 fault," in result.stdout
 
 
 def test_ctrl_c_ends_it_with_a_summary(drive, monkeypatch):

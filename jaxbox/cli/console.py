@@ -63,6 +63,15 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
+def counted(count: int, noun: str) -> str:
+    """A number of things in words.
+
+    >>> counted(1, "sweep"), counted(0, "fault")
+    ('1 sweep', '0 faults')
+    """
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
 class _Lines(Console):
     """Prints each piece of text as one line, see `printable`."""
 

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from jaxbox import io
 from jaxbox._interrupts import heard, stoppable
-from jaxbox.cli.console import ExitCode, exit_code, print_warning, printable, stderr, stdout
+from jaxbox.cli.console import ExitCode, counted, exit_code, print_warning, printable, stderr, stdout
 from jaxbox.cli.inputs import print_json
 from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
 from jaxbox.cli.report import SHOWN_MIN_SCORE
@@ -114,18 +114,18 @@ class LiveAccount:
 
     def describe(self) -> str:
         """The status line."""
-        return f"sweep {self.name}: {self.num_boxes} vehicles; {self.describe_run()}"
+        return f"sweep {self.name}: {counted(self.num_boxes, 'vehicle')}; {self.describe_run()}"
 
     def describe_run(self) -> str:
         """Its second half, of all sweeps."""
         if not self.num_done:
-            return f"no sweep went through; {self.num_skipped} skipped, {self.num_faults} faults"
+            return f"no sweep went through; {self.num_skipped} skipped, {counted(self.num_faults, 'fault')}"
         median, high = self.latencies.quantiles_ms()
         rate = (self.num_done - 1) / max(time.monotonic() - self.start_s, 1e-9)
-        faults = f", {self.num_faults} faults" if self.num_faults else ""
+        faults = f", {counted(self.num_faults, 'fault')}" if self.num_faults else ""
         return (
-            f"{self.num_done} sweeps, {self.num_skipped} skipped{faults}, {rate:.1f}/s; latency p50 "
-            f"{median:.0f} ms, p99 {high:.0f} ms (the last {len(self.latencies)})"
+            f"{counted(self.num_done, 'sweep')}, {self.num_skipped} skipped{faults}, {rate:.1f}/s; latency "
+            f"p50 {median:.0f} ms, p99 {high:.0f} ms (the last {len(self.latencies)})"
         )
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from rich.progress import Progress
 
 from jaxbox._interrupts import stoppable
-from jaxbox.cli.console import ExitCode, exit_code, make_progress, print_error, stderr, stdout
+from jaxbox.cli.console import ExitCode, counted, exit_code, make_progress, print_error, stderr, stdout
 from jaxbox.cluster import ClusterError, DatasetReport, DriveReport, PartitionReport
 from jaxbox.config import DetectorConfig
 from jaxbox.io import InputError, PointConvention
@@ -185,7 +185,8 @@ def _tell_end(report: DatasetReport[Any], options: RayOptions) -> None:
         before = f", {report.num_done_before} done before" if report.num_skipped else ""
         stdout().print(f"{num_done} sweeps done, {report.num_failed} failed{before}", markup=False)
         stdout().print(
-            f"{report.num_boxes} boxes in {len(report.partitions)} partitions by {report.workers} workers, "
+            f"{report.num_boxes} boxes in {counted(len(report.partitions), 'partition')} by "
+            f"{counted(report.workers, 'worker')}, "
             f"{report.elapsed_s:.1f} s in all with starting and compiling, {rate:.1f} sweeps a second",
             markup=False,
         )

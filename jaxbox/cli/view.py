@@ -13,7 +13,7 @@ from jaxbox._interrupts import heard, stoppable
 from jaxbox._loopback import LOOPBACK_NAMES
 from jaxbox.cli.box_filter import EVERY_BOX, BoxFilter
 from jaxbox.cli.config_options import chosen_config
-from jaxbox.cli.console import ExitCode, print_warning, stderr
+from jaxbox.cli.console import ExitCode, counted, print_warning, stderr
 from jaxbox.cli.mounted import describe_mounting, seen_from_sensor
 from jaxbox.config import DetectorConfig
 from jaxbox.viewer import Comparison, View, Wanted, open_viewer
@@ -186,8 +186,7 @@ def warn_of_watchers(host: str) -> None:
 
 
 def _announce(url: str, options: ViewOptions, num_sweeps: int, console: Console) -> None:
-    noun = "sweep" if num_sweeps == 1 else "sweeps"
-    console.print(f"{num_sweeps} {noun} at {url} (Ctrl-C ends it)", markup=False)
+    console.print(f"{counted(num_sweeps, 'sweep')} at {url} (Ctrl-C ends it)", markup=False)
     warn_of_watchers(options.host)
     if options.open_browser:
         webbrowser.open(url)
