@@ -503,6 +503,14 @@ def test_where_a_pose_jumps_all_tracks_end(jump, slow):
     assert status_of(tracks) == TrackStatus.OK
 
 
+@pytest.mark.parametrize("dt", [0.0, -0.1, np.nan])
+def test_of_a_sweep_that_is_passed_over_no_pose_jumps(dt):
+    state, _ = after_two()
+    _, tracks = step(state, cars(PLACES), dt, traffic.pose(50.0).astype(np.float32))
+    assert status_of(tracks) == TrackStatus.TIME_NOT_LATER
+    assert tracks.id[:3].tolist() == [0, 1, 2], "all tracks go on"
+
+
 def test_several_bits_are_set_together():
     state, _ = after_two()
     seen = cars([*PLACES, [30.0, 30.0]])

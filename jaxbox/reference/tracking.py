@@ -115,7 +115,7 @@ def check_interval(dt: float, T_previous_current: np.ndarray, started: bool, con
         status.add("TIME_NOT_LATER")
     if is_gap:
         status.add("TIME_GAP")
-    elif jumps:
+    elif jumps and is_later:
         status.add("POSE_JUMP")
     if not rigid:
         status.add("POSE_INVALID")

@@ -69,7 +69,8 @@ def check_interval(
         TrackStatus.TIME_NOT_LATER: ~is_later,
         TrackStatus.TIME_GAP: is_gap,
         TrackStatus.POSE_INVALID: ~is_rigid,
-        TrackStatus.POSE_JUMP: is_rigid & is_jump & ~is_gap,
+        # Without a time there is no speed, and of a sweep that is passed over no track ends.
+        TrackStatus.POSE_JUMP: is_rigid & is_jump & is_later & ~is_gap,
     }
     return Interval(
         dt=dt,
