@@ -188,6 +188,17 @@ def test_a_first_pose_that_is_none_is_said_too(drive):
     assert statuses(tracked) == [jaxbox.TrackStatus.POSE_INVALID, 0, 0]
 
 
+def test_the_world_of_sweeps_before_the_first_valid_pose_is_that_of_the_others(drive):
+    T = poses_along_x(NUM_SWEEPS)
+    T[:, :3, 3] += 5e5, 5e6, 100.0
+    T[:2] = np.nan
+    tracked = list(jaxbox.track(drive, poses=T))
+    np.testing.assert_array_equal(tracked[0].T_world_sensor, T[2])
+    for sweep in smooth_tracks(tracked):
+        assert np.abs(sweep.tracks.center).max() < 100, "places on earth are no places near the sensor"
+        assert np.abs(sweep.tracks.velocity).max() < 70
+
+
 def test_a_pose_that_jumps_ends_all_tracks(drive):
     T = poses_along_x(NUM_SWEEPS)
     T[4:, 1, 3] += 500.0
@@ -199,16 +210,23 @@ def test_a_pose_that_jumps_ends_all_tracks(drive):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"poses": np.tile(np.eye(4), (2, 1, 1))}, "2 poses for more sweeps"),
+        ({"poses": np.tile(np.eye(4), (2, 1, 1))}, "2 poses for 4 sweeps; give one each"),
+        ({"poses": np.tile(np.eye(4), (5, 1, 1))}, "5 poses for 4 sweeps; give one each"),
         ({"poses": np.eye(3)}, r"poses are \(F, 4, 4\)"),
         ({"poses": "gps"}, "kiss-icp, boxes, none"),
         ({"rate_hz": 0.0}, "rate_hz is 0.0"),
+        ({"rate_hz": np.inf}, "rate_hz is inf; it must be positive and finite"),
         ({"max_tracks": 0}, "max_tracks is 0"),
     ],
 )
 def test_options_that_cannot_be_are_refused(drive, options, message):
     with pytest.raises(ValueError, match=message):
         list(jaxbox.track(drive[:4], **options))
+
+
+def test_fewer_poses_than_sweeps_of_unknown_number_are_an_error_in_their_turn(drive):
+    with pytest.raises(ValueError, match="2 poses for more sweeps than that, such as 02"):
+        list(jaxbox.track(iter(drive[:4]), poses=poses_along_x(2)))
 
 
 def test_no_sweeps_give_no_tracks():
@@ -265,6 +283,24 @@ def test_points_with_times_lose_the_distortion_by_the_poses():
     for index in range(2):  # The last sweep's motion is that of the one before.
         xyz, _ = provider.prepare(index, TimedSweep()).read_points()
         np.testing.assert_allclose(xyz[:, 0], 20, atol=1e-4)
+
+
+def test_the_motion_over_a_missing_sweep_is_twice_as_long_as_the_sweep():
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[1, 0, 3] = 4.0
+    provider = GivenPoses(Poses(T, PoseSource.ODOMETRY, np.array([0, 2 * SWEEP_NS])))
+    for index in range(2):
+        xyz, _ = provider.prepare(index, TimedSweep()).read_points()
+        np.testing.assert_allclose(xyz[:, 0], 20, atol=1e-4)
+
+
+@pytest.mark.parametrize("step_ns", [0, SWEEP_NS // 3, 1.3 * SWEEP_NS, None])
+def test_times_that_jitter_do_not_shorten_the_motion_of_a_sweep(step_ns):
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[1, 0, 3] = 2.0
+    times_ns = None if step_ns is None else np.array([0, step_ns], np.int64)
+    xyz, _ = GivenPoses(Poses(T, PoseSource.POSE_FILE, times_ns)).prepare(0, TimedSweep()).read_points()
+    np.testing.assert_allclose(xyz[:, 0], 20, atol=1e-4)
 
 
 def test_a_single_pose_leaves_points_as_they_are():

@@ -6,7 +6,7 @@ their distortion away, and after it, when the boxes are there.
 
 import dataclasses
 import importlib.util
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,10 +15,12 @@ from jaxbox.geometry.rigid import relative_rigid
 from jaxbox.run.arguments import ReadSweep, dropped_points
 from jaxbox.run.streaming import ReadableSweep
 from jaxbox.tracking.odometry import KissIcp, ego_motion_from_boxes
-from jaxbox.tracking.poses import Poses, PoseSource, check_pose, deskew
+from jaxbox.tracking.poses import Poses, PoseSource, check_pose, deskew, orthonormal_pose
 from jaxbox.types import Detections
 
 _NS_PER_S = 10**9
+_LONGER_THAN_SWEEP = 1.5
+"""Of so many times a sweep's length, a motion is taken to be over missing sweeps."""
 
 
 class PoseProvider(Protocol):
@@ -26,6 +28,8 @@ class PoseProvider(Protocol):
 
     source: PoseSource
     """Where the poses are from."""
+    T_world_first: np.ndarray
+    """(4, 4) float64, m: what is believed of the pose until a valid one comes."""
 
     def prepare(self, index: int, sweep: ReadableSweep) -> ReadableSweep:
         """The sweep as it is to be read for the detector; called in the order of the sweeps, some ahead."""
@@ -70,6 +74,19 @@ class GivenPoses:
     def __init__(self, poses: Poses) -> None:
         self.source = poses.source
         self._T_world_sensor = np.asarray(poses.T_world_sensor, np.float64)
+        self._times_ns = None if poses.times_ns is None else [int(time) for time in poses.times_ns]
+        valid = (orthonormal_pose(T) for T in self._T_world_sensor if check_pose(T) is None)
+        # Elsewhere, in a world of map coordinates, the first sweeps would be thousands of kilometres away.
+        self.T_world_first = next(valid, np.eye(4))
+
+    def check_number(self, count: int) -> None:
+        """Refuses poses that are not one a sweep.
+
+        Raises:
+          ValueError: for sweeps of another number.
+        """
+        if count != len(self._T_world_sensor):
+            raise ValueError(f"{len(self._T_world_sensor)} poses for {count} sweeps; give one each.")
 
     def prepare(self, index: int, sweep: ReadableSweep) -> ReadableSweep:
         """The sweep, whose points are moved to where they were at its own time.
@@ -84,7 +101,8 @@ class GivenPoses:
         pair = self._T_world_sensor[first : first + 2]
         if len(pair) < 2 or any(check_pose(T) for T in pair):
             return sweep
-        return Deskewed(sweep, relative_rigid(pair[0], pair[1]))
+        times_ns = None if self._times_ns is None else self._times_ns[first : first + 2]
+        return Deskewed(sweep, relative_rigid(pair[0], pair[1]), _seconds_between(times_ns))
 
     def locate(self, index: int, detections: Detections) -> np.ndarray:
         """The pose as it was given, which may be invalid."""
@@ -95,13 +113,17 @@ class RegisteredPoints:
     """Poses from the points, by kiss-icp. It reads each sweep before its turn."""
 
     source = PoseSource.KISS_ICP
+    T_world_first = np.eye(4)
 
     def __init__(self) -> None:
         self._odometry = KissIcp()
         self._T_world_sensor: dict[int, np.ndarray] = {}
+        self._last_ns: int | None = None
 
     def prepare(self, index: int, sweep: ReadableSweep) -> ReadableSweep:
         """The sweep with its points, which are read and registered now; a broken one is read again later."""
+        times_ns = self._last_ns, getattr(sweep, "timestamp_ns", None)
+        self._last_ns = times_ns[1]
         try:
             xyz, intensity, time_s = read_timed(sweep)
             before = self._T_world_sensor.get(index - 1)
@@ -111,7 +133,8 @@ class RegisteredPoints:
             return Deskewed(sweep, np.eye(4))
         self._T_world_sensor[index] = T_world_sensor
         if time_s is not None and before is not None:
-            xyz = deskew(xyz, time_s, relative_rigid(before, T_world_sensor))
+            motion, motion_s = relative_rigid(before, T_world_sensor), _seconds_between(times_ns)
+            xyz = deskew(xyz, time_s, motion, duration_s=_duration(time_s, motion_s))
         return ReadSweep(sweep.name, xyz, intensity, dropped_points(sweep))
 
     def locate(self, index: int, detections: Detections) -> np.ndarray:
@@ -126,6 +149,7 @@ class RegisteredBoxes:
     """Poses from the detector's own boxes, most of which stand."""
 
     source = PoseSource.BOXES
+    T_world_first = np.eye(4)
 
     def __init__(self) -> None:
         self._motion = self._T_world_sensor = np.eye(4)
@@ -148,6 +172,7 @@ class Standing:
     """No poses: the sensor is taken to stand."""
 
     source = PoseSource.NONE
+    T_world_first = np.eye(4)
 
     def prepare(self, index: int, sweep: ReadableSweep) -> ReadableSweep:
         """The sweep as it is."""
@@ -174,6 +199,8 @@ class Deskewed:
     """As it lies in its file."""
     T_start_end: np.ndarray
     """(4, 4) float64: the motion of the sensor to the next sweep."""
+    motion_s: float | None = None
+    """How long that motion takes, where it is known: longer than a sweep, where sweeps are missing."""
 
     @property
     def name(self) -> str:
@@ -188,7 +215,26 @@ class Deskewed:
     def read_points(self) -> tuple[np.ndarray, np.ndarray | None]:
         """Reads the points and moves them."""
         xyz, intensity, time_s = read_timed(self.sweep)
-        return (xyz if time_s is None else deskew(xyz, time_s, self.T_start_end)), intensity
+        if time_s is None:
+            return xyz, intensity
+        duration_s = _duration(time_s, self.motion_s)
+        return deskew(xyz, time_s, self.T_start_end, duration_s=duration_s), intensity
+
+
+def _seconds_between(times_ns: Sequence[int | None] | None) -> float | None:
+    """From the first time to the second; None where one is not known."""
+    if times_ns is None or len(times_ns) < 2 or times_ns[0] is None or times_ns[1] is None:
+        return None
+    return (times_ns[1] - times_ns[0]) / _NS_PER_S
+
+
+def _duration(time_s: np.ndarray, motion_s: float | None) -> float | None:
+    """What `deskew` is told of a motion: how long it takes, where it is clearly longer than the sweep.
+
+    Otherwise it is taken to last as long as the sweep, because times of recording jitter.
+    """
+    span_s = float(np.ptp(time_s[np.isfinite(time_s)])) if np.isfinite(time_s).any() else 0.0
+    return motion_s if motion_s is not None and motion_s > _LONGER_THAN_SWEEP * span_s > 0 else None
 
 
 def read_timed(sweep: Any) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
@@ -229,10 +275,10 @@ class Clock:
         """Starts at 0.
 
         Raises:
-          ValueError: for a rate that is not positive.
+          ValueError: for a rate that is not positive or not finite.
         """
-        if not rate_hz > 0:
-            raise ValueError(f"rate_hz is {rate_hz}; it must be positive.")
+        if not 0 < rate_hz < np.inf:
+            raise ValueError(f"rate_hz is {rate_hz}; it must be positive and finite.")
         self._period_ns = _NS_PER_S / rate_hz
         self._times_ns = None if times_ns is None else [int(time) for time in times_ns]
         self._offset_ns = 0

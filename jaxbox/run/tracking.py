@@ -3,7 +3,7 @@
 import collections
 import contextlib
 import dataclasses
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence, Sized
 from typing import Any
 
 import jax
@@ -14,7 +14,14 @@ from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.config.checks import check_ranges
 from jaxbox.geometry.rigid import relative_rigid
 from jaxbox.run.arguments import as_sweeps
-from jaxbox.run.pose_providers import Clock, PoseProvider, make_pose_provider, prepared, without_points
+from jaxbox.run.pose_providers import (
+    Clock,
+    GivenPoses,
+    PoseProvider,
+    make_pose_provider,
+    prepared,
+    without_points,
+)
 from jaxbox.run.streaming import ReadableSweep, StreamedSweep, stream
 from jaxbox.tracking.poses import Poses, PoseSource, check_pose, orthonormal_pose
 from jaxbox.tracking.smoothing import smooth
@@ -99,7 +106,8 @@ def track(
       end with `TrackStatus.TIME_GAP`.
 
     Raises:
-      ValueError: as `stream`; for poses of another number or shape, a rate that is not positive, or no slots.
+      ValueError: as `stream`; for poses of another shape or, as far as the number of sweeps is known, of
+        another number; for a rate that is not positive and finite, or no slots.
       ImportError: for "kiss-icp" without the extra ``track``.
     """
     provider = make_pose_provider(poses)
@@ -107,7 +115,9 @@ def track(
     track_config = TrackConfig() if track_config is None else track_config
     check_ranges(track_config)
     readable = as_sweeps(sweeps, called="jaxbox.track")
-    tracker = Tracker(track_config, provider.source, max_tracks)
+    if isinstance(provider, GivenPoses) and isinstance(sweeps, Sized):
+        provider.check_number(len(sweeps))
+    tracker = Tracker(track_config, provider.source, max_tracks, T_world_first=provider.T_world_first)
     begun: collections.deque[ReadableSweep] = collections.deque()
     streamed = stream(
         prepared(readable, provider, begun), config, key, capacity=capacity, workers=workers, devices=devices
@@ -193,14 +203,23 @@ def _step(
 class Tracker:
     """The tracker's memory, and the last sweep and pose that it accepted: one step a sweep."""
 
-    def __init__(self, config: TrackConfig, source: PoseSource, max_tracks: int) -> None:
+    def __init__(
+        self,
+        config: TrackConfig,
+        source: PoseSource,
+        max_tracks: int,
+        *,
+        T_world_first: np.ndarray | None = None,
+    ) -> None:
         """Begins without tracks.
 
         Args:
           config: the tracker's settings.
           source: where the poses are from.
           max_tracks: capacity for vehicles at a time.
+          T_world_first: (4, 4) float64, m: the pose until a valid one comes; None for the identity.
         """
+        self._T_world_first = np.eye(4) if T_world_first is None else T_world_first
         self._config = jax.tree.map(float, config)
         self._bits = _SOURCE_BITS.get(source, TrackStatus.OK)
         self._state = TrackerState.empty(max_tracks)
@@ -218,7 +237,7 @@ class Tracker:
           T_world_sensor: (4, 4) float64, m; invalid where it is not known.
 
         Returns:
-          The tracks on the host; and the pose, or the last valid one where this one is not.
+          The tracks on the host; and the pose, or the last valid one where this one is not, or the first.
         """
         is_pose = check_pose(T_world_sensor) is None
         T_now = orthonormal_pose(T_world_sensor) if is_pose else None
@@ -234,7 +253,7 @@ class Tracker:
             self._last_ns = time_ns
             # After an invalid pose, the next one gives the motion since the last valid one.
             self._T_world_last = self._T_world_last if T_now is None else T_now
-        T_believed = np.eye(4) if self._T_world_last is None else self._T_world_last
+        T_believed = self._T_world_first if self._T_world_last is None else self._T_world_last
         return dataclasses.replace(tracks, status=np.asarray(int(status), np.int32)), T_believed
 
     def _motion_to(self, T_world_now: np.ndarray | None) -> np.ndarray:
