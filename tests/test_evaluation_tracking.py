@@ -607,6 +607,27 @@ def test_the_command_says_which_result_is_missing_and_can_take_it_for_empty(fold
 
 
 @pytest.mark.parametrize(
+    ("change", "options", "reason"),
+    [
+        ({"type": "Bus"}, (), "results are of type Bus; those that count are Car, Pedestrian, Truck, Van"),
+        ({"track_id": -1}, (), "every result has the identity -1, which stands for no track"),
+        ({"frame": 50}, ("--frames", "0003:0-44"), "no result is in frames 0 to 44"),
+        ({"score": 0.3}, ("--min-score", "0.5"), "no result scores 0.5 or more"),
+        ({"type": "van"}, (), None),
+    ],
+)
+def test_where_no_result_counts_the_command_says_why(folder, change, options, reason):
+    path = folder / "results" / "0003.txt"
+    first = io.read_tracks(path)[0]
+    io.write_tracks(path, [dataclasses.replace(first, **change)])
+    chosen = ("--labels", folder / "truth", "--results", folder / "results", "--frames", "0003")
+    result = run("eval", "--tracking", *(chosen[:4] if options[:1] == ("--frames",) else chosen), *options)
+    assert result.exit_code == 0, result.stderr
+    assert (f"0003: no result counts: {reason}." in result.stdout) == (reason is not None)
+    assert ("no result counts" in result.stdout) == (reason is not None)
+
+
+@pytest.mark.parametrize(
     ("options", "message"),
     [
         (("--frames", "0003:5"), "give SEQUENCE:FIRST-LAST"),
@@ -615,6 +636,7 @@ def test_the_command_says_which_result_is_missing_and_can_take_it_for_empty(fold
         (("--frames", "0003:0-45"), "the last one with a label or a result is 44"),
         (("--frames", "0003:5-4"), "frames 5 to 4"),
         (("--pictures",), "is for single sweeps"),
+        (("--min-score", "nan"), "--min-score is nan; give a finite number"),
     ],
 )
 def test_options_that_cannot_be_used_end_with_exit_code_2(folder, options, message):

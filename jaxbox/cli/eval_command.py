@@ -1,5 +1,6 @@
 """Options of ``jaxbox eval``, of single sweeps and of tracks."""
 
+import math
 import pathlib
 from collections.abc import Mapping
 from typing import Annotated
@@ -81,6 +82,8 @@ def evaluate(
     command goes on where it was interrupted.
     """
     _check_options(tracking=tracking, frames=frames, plots=plots, drives=drives, pictures=pictures)
+    if min_score is not None and not math.isfinite(min_score):
+        raise typer.BadParameter(f"--min-score is {min_score:g}; give a finite number.")
     if not tracking and min_score is not None and not 0 <= min_score <= 1:
         raise typer.BadParameter(f"--min-score is {min_score:g}; scores of detections are from 0 to 1.")
     if not tracking and protocol is None and min_score is not None and not pictures:

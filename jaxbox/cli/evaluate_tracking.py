@@ -96,6 +96,8 @@ def print_tracking_report(report: Mapping[str, Any], console: Console) -> None:
             f"missed. Where those frames were not processed: --frames {name}:0-{last_result}",
             markup=False,
         )
+    for name, reason in report["without_effect"].items():
+        console.print(f"{name}: no result counts: {reason}.", markup=False)
     tracks = report["vehicle"]["tracks"]
     rows = {f"KITTI {name}, 2D": part for name, part in report["kitti"].items()}
     rows |= {METRIC_NAMES[metric]: part for metric, part in (tracks or {}).items()}

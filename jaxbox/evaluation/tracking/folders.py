@@ -12,11 +12,14 @@ from jaxbox.evaluation.report import find_results
 from jaxbox.evaluation.tracking.protocol import DISTRACTORS, compare_in_image
 from jaxbox.evaluation.tracking.report import evaluate_boxes, measure_tracks
 from jaxbox.evaluation.tracking.sequences import FrameBoxes, FrameTruth, TruthSequence
-from jaxbox.io import InputError, KittiObject, objects_by_frame, read_calibration, read_tracks
+from jaxbox.io import VEHICLE_TYPES, InputError, KittiObject, objects_by_frame, read_calibration, read_tracks
 from jaxbox.io.kitti_tracking import NO_TRACK
 from jaxbox.types import Calibration
 
 LABELS_FOLDER, CALIBRATION_FOLDER = "label_02", "calib"
+
+_TYPES = sorted({*VEHICLE_TYPES, *DISTRACTORS})
+"""Types of results that a figure is of."""
 
 Frames = tuple[Sequence[KittiObject], ...]
 
@@ -67,6 +70,8 @@ def evaluate_tracking_folders(
         "kitti": `measure_tracks` of the 2D boxes by class, of cars and of pedestrians where there are any
           results of them;
         "vehicle": `evaluate_boxes` of Car, Van and Truck;
+        "without_effect": why no result counts as a vehicle's, of each sequence with results of which none
+          does;
         "unfinished": last frame with a result, of each sequence whose labels go on after it though no
           frames were chosen: they count as missed;
         "num_missing_results": files that were taken for empty.
@@ -94,6 +99,11 @@ def evaluate_tracking_folders(
             },
             min_score=min_score,
         ),
+        "without_effect": {
+            name: reason
+            for name, item in sequences.items()
+            if (reason := _why_none_counts(item, min_score)) is not None
+        },
         "unfinished": {
             name: item.last_result
             for name, item in sequences.items()
@@ -108,6 +118,23 @@ def _above(sequence: TrackingSequence, min_score: float) -> Frames:
         [item for item in found if item.score is None or item.score >= min_score]
         for found in sequence.results
     )
+
+
+def _why_none_counts(sequence: TrackingSequence, min_score: float) -> str | None:
+    """Why all figures of a sequence with results are zero; None where they need not be."""
+    if sequence.last_result is None:
+        return None
+    items = [item for found in sequence.results for item in found]
+    if not items:
+        return f"no result is in frames {sequence.first_frame} to {sequence.last_frame}"
+    if all(item.track_id == NO_TRACK for item in items):
+        return f"every result has the identity {NO_TRACK}, which stands for no track"
+    if not any(found for found in _above(sequence, min_score)):
+        return f"no result scores {min_score:g} or more"
+    types = sorted({item.type for item in items})
+    if not {name.lower() for name in types} & {name.lower() for name in _TYPES}:
+        return f"results are of type {', '.join(types)}; those that count are {', '.join(_TYPES)}"
+    return None
 
 
 def _goes_on(sequence: TrackingSequence) -> bool:
