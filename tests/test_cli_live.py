@@ -80,6 +80,7 @@ def test_ctrl_c_ends_it_with_a_summary(drive, monkeypatch):
     [
         (("--poses", "gps"), "--poses gps: choose one of auto, kiss-icp"),
         (("--rate-hz", 0), "--rate-hz is 0"),
+        (("--rate-hz", "inf"), "--rate-hz is inf"),
         (("--timeout", 0), "--timeout is 0"),
     ],
 )

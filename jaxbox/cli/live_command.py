@@ -1,5 +1,6 @@
 """Options of ``jaxbox live``."""
 
+import math
 from typing import Annotated
 
 import typer
@@ -132,8 +133,8 @@ def live(
     """
     with input_errors():
         for name, value in (("--rate-hz", rate_hz), ("--timeout", timeout)):
-            if not value > 0:
-                raise typer.BadParameter(f"{name} is {value:g}; it must be positive.")
+            if not 0 < value < math.inf:
+                raise typer.BadParameter(f"{name} is {value:g}; it must be positive and finite.")
         if poses not in (AUTO, *ESTIMATED):
             raise InputError(f"--poses {poses}: choose one of {', '.join((AUTO, *map(str, ESTIMATED)))}.")
         config = LiveConfig(

@@ -1,5 +1,6 @@
 """Options of ``jaxbox track``."""
 
+import math
 import pathlib
 from typing import Annotated, Any
 
@@ -178,7 +179,7 @@ def track(
     what became of every sweep, and an interrupted drive has no file.
     """
     with input_errors():
-        if not rate_hz > 0:
+        if not 0 < rate_hz < math.inf:
             raise typer.BadParameter(f"--rate-hz is {rate_hz:g}; give sweeps a second, such as 10.")
         convention = PointConvention(scale, axes, flip, columns)
         least, by_class = (0.0, {}) if min_score is None else parse_min_score(min_score)

@@ -1,5 +1,6 @@
 """A recording, or a folder of sweeps, as if its sensor were running: each sweep comes at its own time."""
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 
@@ -32,9 +33,9 @@ class RecordedSource:
           loop: whether it begins again where it ends, as another drive.
 
         Raises:
-          ValueError: for a rate that is not positive.
+          ValueError: for a rate that is not positive, or infinite.
         """
-        if not rate_hz > 0:
+        if not 0 < rate_hz < math.inf:
             raise ValueError(f"rate_hz is {rate_hz}; give sweeps a second, such as 10.")
         self.name = name
         self._sweeps, self._loop = sweeps, loop
