@@ -351,6 +351,39 @@ def test_a_broken_sweep_is_reported_and_its_drive_is_done_again_once_it_is_mende
     assert [record["frame"] for record in records_of(output)] == list(range(5))
 
 
+def test_a_drive_that_has_got_more_sweeps_is_done_again(kitti, tmp_path):
+    root, output = tmp_path / "training", tmp_path / "out"
+    shutil.copytree(kitti, root)
+    last = root / "velodyne" / "0001" / "000002.bin"
+    last.rename(tmp_path / "000002.bin")
+    assert track(root, output, *LIGHT).exit_code == 0
+    before = (output / "0000.txt").stat().st_mtime_ns
+    (tmp_path / "000002.bin").rename(last)
+    again = track(root, output, *LIGHT, "--resume", "--json")
+    assert again.exit_code == 0, again.stderr
+    assert json.loads(again.stdout.splitlines()[-1])["summary"]["skipped"] == 5
+    assert [record["frame"] for record in records_of(output, "0001")] == [0, 1, 2]
+    assert (output / "0000.txt").stat().st_mtime_ns == before
+    assert json.loads((output / "run.json").read_text())["num_sweeps"] == {"0000": 5, "0001": 3}
+    done = track(root, output, *LIGHT, "--resume", "--json")
+    assert json.loads(done.stdout)["summary"]["skipped"] == 8
+
+
+def test_a_drive_without_a_file_in_a_folder_of_poses_fails_and_the_others_go_on(kitti, tmp_path):
+    poses = tmp_path / "poses"
+    shutil.copytree(kitti / "poses", poses)
+    (poses / "0000.txt").unlink()
+    result = run("track", kitti, "--output", tmp_path / "out", "--poses", poses, *LIGHT)
+    assert result.exit_code == 1
+    assert "0000.txt: there is no such file" in result.stderr
+    assert len(records_of(tmp_path / "out", "0001")) == 3
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["incomplete"] == ["0000"]
+
+
+def test_of_a_drive_of_which_nothing_was_done_no_poses_are_told():
+    assert SequenceReport("a").describe() == "a: 0 sweeps, 0 vehicles, 0 of them moved"
+
+
 def test_a_drive_without_any_good_sweep_leaves_no_file(kitti, tmp_path):
     folder = tmp_path / "training" / "velodyne" / "0007"
     folder.mkdir(parents=True)
@@ -425,6 +458,7 @@ def test_real_vehicles_keep_their_ids_and_have_their_speeds(data_root, tmp_path)
         (["--track-set", "gate=wide"], "gate is 'wide'; it must be a finite number"),
         (["--poses", "nowhere.txt"], "nowhere.txt"),
         (["--rate-hz", "0"], "--rate-hz is 0"),
+        (["--rate-hz", "inf"], "--rate-hz is inf"),
         (["--set", "nothing=1"], "there is no setting nothing"),
     ],
 )

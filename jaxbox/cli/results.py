@@ -281,6 +281,14 @@ class RunAccount:
                 "another --output."
             ) from error
 
+    def earlier_num_sweeps(self) -> Mapping[str, int]:
+        """How many sweeps each sequence had in the run that is resumed, as far as its account says."""
+        try:
+            recorded = json.loads((self.output / RUN_NAME).read_bytes())["num_sweeps"]
+            return {str(name): int(count) for name, count in recorded.items()}
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            return {}
+
     def write(self, **outcome: Any) -> None:
         """Writes the two files; before the run without an outcome, and after it."""
         account = {

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import pathlib
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from typing import Any
@@ -111,11 +112,12 @@ def run_track(paths: Sequence[str], options: TrackOptions) -> ExitCode:
     if len(sweeps) == 0:
         raise io.InputError(f"{', '.join(paths)}: no sweeps there; the recording is empty.")
     sequences = io.group_sequences(sweeps)
-    earlier = account.earlier_incomplete() if options.resume else None
+    earlier = _Earlier.of(account) if options.resume else None
     run, start = TrackReport(), time.perf_counter()
     sheet = RunSheet(options.output, sweeps, shown=options.sheet)
     pending = [name for name, group in sequences if not _is_finished(name, group, options, earlier)]
-    account.write(finished=False, incomplete=pending)
+    num_sweeps = {name: len(group) for name, group in sequences}
+    account.write(finished=False, incomplete=pending, num_sweeps=num_sweeps)
     with stoppable(), make_progress(shown=options.speaks) as progress:
         task = progress.add_task("tracking", total=len(sweeps))
         for name, group in sequences:
@@ -128,7 +130,7 @@ def run_track(paths: Sequence[str], options: TrackOptions) -> ExitCode:
             _run_sequence(group, report, options, sheet, lambda: progress.advance(task))
             if report.is_complete:
                 pending.remove(name)
-            _write_account(account, run, pending)
+            _write_account(account, run, pending, num_sweeps)
             _describe_sequence(report, options)
             if report.interrupted:
                 break
@@ -138,17 +140,40 @@ def run_track(paths: Sequence[str], options: TrackOptions) -> ExitCode:
     return exit_code(failed=bool(run.failures), interrupted=run.interrupted)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Earlier:
+    """What the account of the run that is resumed says of its sequences."""
+
+    incomplete: frozenset[str] | None
+    """Those that it has not done; None where there is no such run."""
+    num_sweeps: Mapping[str, int]
+    """How many sweeps each had, as far as it says."""
+
+    @classmethod
+    def of(cls, account: RunAccount) -> "_Earlier":
+        return cls(account.earlier_incomplete(), account.earlier_num_sweeps())
+
+    def has_done(self, name: str, num_sweeps: int) -> bool:
+        """Whether it has done a sequence, which has got no further sweeps since."""
+        if self.incomplete is None or name in self.incomplete:
+            return False
+        return self.num_sweeps.get(name, num_sweeps) == num_sweeps
+
+
 def _is_finished(
-    name: str, sweeps: Sequence[io.Sweep], options: TrackOptions, earlier: frozenset[str] | None
+    name: str, sweeps: Sequence[io.Sweep], options: TrackOptions, earlier: _Earlier | None
 ) -> bool:
-    """Whether an earlier run has done a whole sequence; `earlier` are those that it has not."""
-    if earlier is None or name in earlier or len(sweeps) == 0:
+    """Whether an earlier run has done a whole sequence."""
+    if earlier is None or len(sweeps) == 0 or not earlier.has_done(name, len(sweeps)):
         return False
     return options.files_of(name).are_there(has_camera=sweeps[0].is_calibrated)
 
 
-def _write_account(account: RunAccount, run: TrackReport, pending: Sequence[str]) -> None:
+def _write_account(
+    account: RunAccount, run: TrackReport, pending: Sequence[str], num_sweeps: Mapping[str, int]
+) -> None:
     account.write(
+        num_sweeps=num_sweeps,
         finished=not (pending or run.interrupted),
         interrupted=run.interrupted,
         incomplete=list(pending),
@@ -202,7 +227,15 @@ class _Drive:
     def go(self) -> None:
         """Tracks and writes; ends early, with what is done, where it is interrupted or breaks off."""
         kept: list[tuple[int, TrackedSweep]] = []
-        source = self._track()
+        try:
+            poses = self._find_poses()
+        except io.InputError as error:
+            if not pathlib.Path(self._options.poses).is_dir():
+                raise
+            # Of a folder with a file a drive, the other drives' may serve.
+            _fail(self._report, self._report.name, str(error))
+            return
+        source = self._track(poses)
         try:
             for index, tracked in enumerate(source):
                 if tracked.error is not None:
@@ -223,14 +256,14 @@ class _Drive:
         for (index, _), tracked in zip(kept, smoothed, strict=True):
             self._write(index, tracked)
 
-    def _track(self) -> Generator[TrackedSweep, None, None]:
+    def _track(self, poses: Poses | PoseSource | None) -> Generator[TrackedSweep, None, None]:
         # Results and pictures show points that were read anyway.
         options = self._options
         return track(
             (KeptSweep(sweep, keeps=self._wants_points(sweep.name)) for sweep in self._sweeps),
             options.config,
             options.track_config,
-            poses=self._find_poses(),
+            poses=poses,
             capacity=options.capacity,
             max_tracks=options.max_tracks,
             rate_hz=options.rate_hz,

@@ -72,9 +72,10 @@ class SequenceReport:
     def describe(self) -> str:
         """One sentence."""
         changes = f", {len(self.lane_changes)} changed lanes" if self.lane_changes else ""
+        poses = f"; poses: {self.pose_source}" if self.pose_source else ""
         return (
             f"{self.name}: {self.num_done} sweeps, {len(self.vehicles)} vehicles, {len(self.movers)} of them "
-            f"moved{changes}; poses: {self.pose_source or 'none'}"
+            f"moved{changes}{poses}"
         )
 
     def warnings(self) -> list[str]:

@@ -3,7 +3,7 @@
 import collections
 import contextlib
 import dataclasses
-from collections.abc import Generator, Iterable, Sequence, Sized
+from collections.abc import Generator, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -106,8 +106,8 @@ def track(
       end with `TrackStatus.TIME_GAP`.
 
     Raises:
-      ValueError: as `stream`; for poses of another shape or, as far as the number of sweeps is known, of
-        another number; for a rate that is not positive and finite, or no slots.
+      ValueError: as `stream`; for poses of another shape, fewer than sweeps, or more than a list, tuple or
+        array of them has; for a rate that is not positive and finite, or no slots.
       ImportError: for "kiss-icp" without the extra ``track``.
     """
     provider = make_pose_provider(poses)
@@ -115,7 +115,7 @@ def track(
     track_config = TrackConfig() if track_config is None else track_config
     check_ranges(track_config)
     readable = as_sweeps(sweeps, called="jaxbox.track")
-    if isinstance(provider, GivenPoses) and isinstance(sweeps, Sized):
+    if isinstance(provider, GivenPoses) and isinstance(sweeps, list | tuple | np.ndarray):
         provider.check_number(len(sweeps))
     tracker = Tracker(track_config, provider.source, max_tracks, T_world_first=provider.T_world_first)
     begun: collections.deque[ReadableSweep] = collections.deque()
