@@ -235,8 +235,8 @@ def test_one_quarter_turn_is_outvoted_and_changes_neither_size_nor_extent():
         np.testing.assert_allclose(tracks.filtered_size[0], [4.2, 1.8, 1.5], atol=1e-3)
         if crossed:
             np.testing.assert_array_equal(state.slots.extent, before.extent)
-            # Of the box that lies across, the side along the track is its width.
-            np.testing.assert_allclose(tracks.size[0], [4.2, 4.2, 1.5], atol=1e-3)
+            # The length of the box that lies across is not taken for the track's width.
+            np.testing.assert_allclose(tracks.size[0], [4.2, 1.8, 1.5], atol=1e-3)
 
 
 def test_boxes_whose_points_were_not_counted_have_a_yaw_all_the_same():

@@ -279,6 +279,8 @@ def keep_visible_faces(center: np.ndarray, size: np.ndarray, yaw: float, new_siz
 def refine_box(track: Track, seen: Any, row: int) -> Box:
     """The box of a detection, with the yaw that the track knows, and its length unless most of it was seen.
 
+    The width is the track's where the box lies across it.
+
     Args:
       track: updated.
       seen: D detections.
@@ -291,9 +293,9 @@ def refine_box(track: Track, seen: Any, row: int) -> Box:
     yaw = float(seen.yaw[row])
     if track.hits <= MATURE_HITS:
         return Box(center, size, wrap_yaw(yaw))
-    crossed, length = is_crossed(yaw, track.yaw), track.size()[0]
+    crossed, (length, width, _) = is_crossed(yaw, track.yaw), track.size()
     flat = size[1::-1] if crossed else size[:2]
     seen_whole = not crossed and seen.extent[row][0] > SEEN_SHARE * length
-    new = np.array([flat[0] if seen_whole else length, flat[1]])
+    new = np.array([flat[0] if seen_whole else length, width if crossed else flat[1]])
     place = keep_visible_faces(center[:2], flat, track.yaw, new)
     return Box(np.array([*place, center[2]]), np.array([*new, size[2]]), wrap_yaw(track.yaw))

@@ -190,7 +190,7 @@ def refine_boxes(slots: Slots, seen: Observations) -> tuple[jax.Array, jax.Array
     where this sweep did not see it, how long it is.
 
     The visible faces stay where this sweep saw them, so that errors of the poses do not matter. Width and
-    height are its own too: they are seen more often than not.
+    height are its own too, as they are seen more often than not; but for the width of a box across the track.
 
     Args:
       slots: T tracks.
@@ -201,9 +201,11 @@ def refine_boxes(slots: Slots, seen: Observations) -> tuple[jax.Array, jax.Array
     """
     crossed = is_crossed(seen.yaw, slots.yaw)[:, None]
     flat = jnp.where(crossed, seen.size[:, 1::-1], seen.size[:, :2])
-    length = track_size(slots)[:, 0]
+    length, width = track_size(slots)[:, 0], track_size(slots)[:, 1]
     is_seen = ~crossed[:, 0] & (seen.extent[:, 0] > SEEN_SHARE * length)
-    new = jnp.stack([jnp.where(is_seen, flat[:, 0], length), flat[:, 1]], axis=1)
+    # The length of a box that lies across the track is not its width.
+    sides = jnp.where(is_seen, flat[:, 0], length), jnp.where(crossed[:, 0], width, flat[:, 1])
+    new = jnp.stack(sides, axis=1)
     center = keep_visible_faces(seen.center[:, :2], flat, slots.yaw, new)
     known = slots.hits > MATURE_HITS
     return (
