@@ -170,15 +170,25 @@ def test_one_time_that_is_an_hour_off_does_not_end_the_drive(drive):
     assert shown(tracked[-1])[0]
 
 
-def test_a_pose_of_nan_is_said_and_the_next_tells_the_way_since_the_last_good_one(drive):
-    T = poses_along_x(NUM_SWEEPS)
-    T[4] = np.nan
+def test_poses_of_nan_are_said_and_the_sensor_goes_on_as_it_did(drive):
+    true = poses_along_x(NUM_SWEEPS)
+    T = true.copy()
+    T[3:5] = np.nan
     tracked = list(jaxbox.track(drive, poses=T))
     invalid = jaxbox.TrackStatus.POSE_INVALID
-    assert statuses(tracked) == [0, 0, 0, 0, invalid, 0, 0]
-    np.testing.assert_allclose(tracked[4].T_world_sensor, T[3])
-    assert shown(tracked[-1])[0] & shown(tracked[3])[0]
+    assert statuses(tracked) == [0, 0, 0, invalid, invalid, 0, 0]
+    np.testing.assert_allclose([sweep.T_world_sensor for sweep in tracked], true, atol=1e-5)
+    assert shown(tracked[-1])[0] & shown(tracked[2])[0]
     assert all(np.isfinite(sweep.tracks.center).all() for sweep in tracked)
+
+
+def test_many_poses_of_nan_are_no_jump(drive):
+    # At 25 m/s the sensor is 10 m farther when a pose comes again, and is not that fast.
+    T = poses_along_x(NUM_SWEEPS)
+    T[:, 0, 3] *= 2.5 / STEP_M
+    T[2:5] = np.nan
+    invalid = jaxbox.TrackStatus.POSE_INVALID
+    assert statuses(list(jaxbox.track(drive, poses=T))) == [0, 0, invalid, invalid, invalid, 0, 0]
 
 
 def test_a_first_pose_that_is_none_is_said_too(drive):

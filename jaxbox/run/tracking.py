@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 
 from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.config.checks import check_ranges
-from jaxbox.geometry.rigid import relative_rigid
+from jaxbox.geometry.rigid import partial_motion, relative_rigid
 from jaxbox.run.arguments import as_sweeps
 from jaxbox.run.pose_providers import (
     Clock,
@@ -225,6 +225,7 @@ class Tracker:
         self._state = TrackerState.empty(max_tracks)
         self._last_ns: int | None = None
         self._T_world_last: np.ndarray | None = None
+        self._last_motion: tuple[np.ndarray, float] | None = None
 
     def step(
         self, detections: Detections, time_ns: int, T_world_sensor: np.ndarray
@@ -237,24 +238,33 @@ class Tracker:
           T_world_sensor: (4, 4) float64, m; invalid where it is not known.
 
         Returns:
-          The tracks on the host; and the pose, or the last valid one where this one is not, or the first.
+          The tracks on the host; and the pose: where it is invalid, that of a sensor which goes on as it did,
+          and before any valid one the first of these.
         """
-        is_pose = check_pose(T_world_sensor) is None
-        T_now = orthonormal_pose(T_world_sensor) if is_pose else None
+        is_pose, dt = check_pose(T_world_sensor) is None, self._seconds_to(time_ns)
+        T_now = orthonormal_pose(T_world_sensor) if is_pose else self._carried_on(float(dt))
         motion = self._motion_to(T_now)
-        self._state, tracks = _step(
-            self._state, without_points(detections), self._seconds_to(time_ns), motion, self._config
-        )
+        self._state, tracks = _step(self._state, without_points(detections), dt, motion, self._config)
         tracks = tracks.on_host()
         status = TrackStatus(int(tracks.status)) | self._bits
         # The first sweep has no motion yet, so the step has not checked its pose.
         status |= TrackStatus.OK if is_pose else TrackStatus.POSE_INVALID
         if TrackStatus.TIME_NOT_LATER not in status:
             self._last_ns = time_ns
-            # After an invalid pose, the next one gives the motion since the last valid one.
+            is_motion = is_pose and self._T_world_last is not None and TrackStatus.POSE_JUMP not in status
+            if is_motion and dt > 0:
+                self._last_motion = motion.astype(np.float64), float(dt)
+            # Where the sensor cannot be carried on, the next pose gives the motion since the last one.
             self._T_world_last = self._T_world_last if T_now is None else T_now
         T_believed = self._T_world_first if self._T_world_last is None else self._T_world_last
         return dataclasses.replace(tracks, status=np.asarray(int(status), np.int32)), T_believed
+
+    def _carried_on(self, dt: float) -> np.ndarray | None:
+        """The pose of a sensor that goes on as in the last interval; None where that is not known."""
+        if self._T_world_last is None or self._last_motion is None or not 0 < dt <= self._config.max_gap_s:
+            return None
+        motion, seconds = self._last_motion
+        return self._T_world_last @ partial_motion(motion, dt / seconds)
 
     def _motion_to(self, T_world_now: np.ndarray | None) -> np.ndarray:
         """(4, 4) float32: T_previous_current, of NaN where there is no pose."""

@@ -60,7 +60,7 @@ _STATUS_TEXT = {
     TrackStatus.TIME_GAP: "more than TrackConfig.max_gap_s passed since the sweep before; all tracks ended, "
     "and new ones began.",
     TrackStatus.POSE_INVALID: "the pose is not finite or not a rigid transform; the ego vehicle was taken to "
-    "stand. Check the source of the poses.",
+    "stand, or by jaxbox.track to go on as it did. Check the source of the poses.",
     TrackStatus.POSE_JUMP: "the pose moved faster than TrackConfig.max_ego_speed_mps; all tracks ended, "
     "and new ones began. Check the source of the poses.",
     TrackStatus.INVALID_DETECTIONS: "detections with numbers that are NaN, infinite or beyond a million were "
