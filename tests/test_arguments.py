@@ -164,8 +164,11 @@ def test_what_a_cloud_had_no_room_for_is_counted_in_streams_too(xyz, poses):
     num_kept = 1000
     cloud = PointCloud.from_numpy(xyz, capacity=num_kept)
     options = {"devices": jax.devices()[:1]}
-    (streamed,), (tracked,) = jaxbox.stream([cloud], **options), jaxbox.track([cloud], poses=poses, **options)
-    for result in (streamed, tracked):
+    streamed, tracked = (
+        jaxbox.stream([cloud] * 2, **options),
+        jaxbox.track([cloud] * 2, poses=poses, **options),
+    )
+    for result in (*streamed, *tracked):
         assert result.num_points == result.detections.counts.num_points == len(xyz)
         assert result.detections.counts.dropped_points == len(xyz) - num_kept
         assert Status.POINT_OVERFLOW in Status(int(result.detections.status))
