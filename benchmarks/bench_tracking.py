@@ -129,10 +129,9 @@ def row(truth: Mapping[str, TruthSequence], results: Mapping[str, list[FrameBoxe
 
 
 def side_by_side(
-    name: str, truth: TruthSequence, tracked: Sequence[TrackedSweep]
+    name: str, truth: TruthSequence, tracked: Sequence[TrackedSweep], smoothed: Sequence[TrackedSweep]
 ) -> dict[str, dict[str, Any]]:
     """Single sweeps, online and offline."""
-    smoothed = smooth_tracks(tracked)
     kinds = {
         "single sweep": [FrameBoxes.of_detections(sweep.detections) for sweep in checked(tracked)],
         "online": seen_boxes(tracked),
@@ -157,10 +156,12 @@ def measure_real(config: DetectorConfig, poses: str | None) -> dict[str, Any]:
             for sweep in sweeps
         ]
         truth = TruthSequence(frames, calibration)
-        found[name] = side_by_side(name, truth, tracked) | {"poses": str(tracked[0].pose_source)}
+        smoothed = smooth_tracks(tracked)
+        poses_of = {"poses": str(tracked[0].pose_source)}
+        found[name] = side_by_side(name, truth, tracked, smoothed) | poses_of
         of_sweeps = [labels.get(sweep.frame or 0, []) for sweep in sweeps]
         online = [seen_only(of_sweep.tracks) for of_sweep in checked(tracked)]
-        offline = [of_sweep.tracks for of_sweep in checked(smooth_tracks(tracked))]
+        offline = [of_sweep.tracks for of_sweep in checked(smoothed)]
         for kind, tracks in (("online", online), ("offline", offline)):
             found[name][kind]["figures"]["HOTA Car 2D"] = hota_in_image(of_sweeps, tracks, calibration)
     return found
@@ -202,7 +203,7 @@ def measure_synthetic(config: DetectorConfig, num_sweeps: int) -> dict[str, Any]
         sweeps = list(sequence)
         tracked = list(jaxbox.track(sweeps, config, poses=poses))
         frames = [true_frame(sweep) for sweep in sweeps]
-        found[name] = side_by_side(name, TruthSequence(frames), tracked)
+        found[name] = side_by_side(name, TruthSequence(frames), tracked, smooth_tracks(tracked))
     return found
 
 

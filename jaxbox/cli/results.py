@@ -82,7 +82,7 @@ def written(path: pathlib.Path, *, advice: str = _RESUME_ADVICE) -> Iterator[Non
     except OSError as error:
         raise OutputError(
             f"{path}: cannot be written ({error.strerror or error}). Free space or fix the permissions, "
-            + advice
+            f"{advice}"
         ) from error
 
 
