@@ -117,22 +117,42 @@ class Computation:
         """Size of a result; 0 where the name is not an instruction of the computation."""
         return bytes_of(self.lines[name].shape) if name in self.lines else 0
 
+    @functools.cached_property
+    def needed(self) -> dict[str, float]:
+        """Of each result, the share that is computed: of what is sliced or gathered, as much as is taken."""
+        needed = dict.fromkeys(self.lines, 0.0)
+        needed[self.root] = 1.0
+        for line in reversed(self.lines.values()):
+            for operand in dict.fromkeys(line.operands):
+                if operand in self.lines:
+                    share = needed[operand] + self._needs(line, operand, needed[line.name])
+                    needed[operand] = min(share, 1.0)
+        return needed
+
+    def _needs(self, line: Line, name: str, share: float) -> float:
+        """Share of an operand that an instruction takes for a share of its own result."""
+        if line.operation in SLICES and name not in line.operands[1:]:
+            return share * self.size(line.name) / max(self.size(name), 1)
+        if line.operation == "broadcast":
+            return min(share * self.size(line.name) / max(self.size(name), 1), 1.0)
+        if line.operation in {"scatter", "dynamic-update-slice"}:
+            return 1.0
+        return share
+
     def read(self, name: str) -> int:
         """How much of a result, whole or in slices, is read within the computation."""
         parts = [self._read_by(line, name) for line in self.readers.get(name, [])]
-        return min(sum(parts), self.size(name))
+        return int(min(sum(parts), self.size(name)))
 
-    def _read_by(self, line: Line, name: str) -> int:
+    def _read_by(self, line: Line, name: str) -> float:
         if line.operation in SAME_BYTES:
             return self.read(line.name)
-        if line.operation in SLICES and name not in line.operands[1:]:
-            return self.size(line.name)
         if line.operation == "tuple":
             return 0  # A fusion that hands on what it was given writes it in place.
         if name in self._updated(line):
             # A scatter adds to what is there, or compares with it.
             return self._updates(line) if line.operation == "scatter" else 0
-        return self.size(name)
+        return self._needs(line, name, self.needed[line.name]) * self.size(name)
 
     def written(self, name: str | None = None) -> int:
         """How much of a result, by default the computation's, has to be written."""

@@ -99,6 +99,14 @@ StackFrames
   ROOT %negate.1 = f32[10]{0} negate(%slice.1), metadata={op_name="neg" stack_frame_id=5}
 }
 
+%fused_gather (p.10: f32[100], p.11: f32[100], p.12: s32[4,1]) -> f32[4] {
+  %p.10 = f32[100]{0} parameter(0)
+  %p.11 = f32[100]{0} parameter(1)
+  %add.2 = f32[100]{0} add(%p.10, %p.11)
+  %p.12 = s32[4,1]{1,0} parameter(2)
+  ROOT %gather.1 = f32[4]{0} gather(%add.2, %p.12), slice_sizes={1}
+}
+
 %fused_scatter (p.4: f32[100], p.5: s32[7,1], p.6: f32[7]) -> f32[100] {
   %p.4 = f32[100]{0} parameter(0)
   %p.5 = s32[7,1]{1,0} parameter(1)
@@ -130,6 +138,7 @@ ENTRY %main.1 (a: f32[100], b: f32[100], i: s32[7,1], u: f32[7], v: f32[10], k: 
   %loop_slice_fusion = f32[10]{0} fusion(%input_scatter_fusion), kind=kLoop, calls=%fused_slice
   %while.2 = (f32[100]{0}, s32[]) while(%tuple.2), condition=%c, config={"known_trip_count":{"n":"3"}}
   %loop_update_fusion = (f32[100]{0}, f32[10]{0}) fusion(%a, %v, %k), kind=kLoop, calls=%fused_update
+  %loop_gather_fusion = f32[4]{0} fusion(%a, %b, %i), kind=kLoop, calls=%fused_gather
   %dynamic-slice.1 = f32[5]{0} dynamic-slice(%a, %k), dynamic_slice_sizes={5}
   ROOT %multiply.1 = f32[100]{0} multiply(%a, %a)
 }
@@ -209,6 +218,11 @@ def test_what_is_read_whole_counts_whole_and_once(instructions):
 def test_of_a_slice_only_the_slice_is_read(instructions):
     assert moved(instructions["loop_slice_fusion"]) == (40, 40)
     assert moved(instructions["dynamic-slice.1"]) == (20 + 4, 20)
+
+
+def test_what_a_fusion_works_out_to_look_up_some_of_it_is_worked_out_for_those(instructions):
+    # Four entries of a sum of two arrays, at four places.
+    assert moved(instructions["loop_gather_fusion"]) == (16 + 16 + 16, 16)
 
 
 def test_what_is_updated_in_place_counts_by_its_updates(instructions):
