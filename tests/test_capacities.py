@@ -66,6 +66,8 @@ def test_a_capacity_that_is_not_used_is_never_full():
 def test_capacities_without_a_number_are_a_share_of_the_cloud_rounded_up():
     config = DetectorConfig()
     assert [obstacle_capacity(config, n) for n in (1, 4, 1001)] == [1, 3, 751]
-    assert [slab_capacity(config, n) for n in (1, 4, 1001)] == [1, 1, 251]
+    # A quarter of few rows, an eighth of many.
+    sizes = [slab_capacity(config, n) for n in (8, 1001, 2**16, 2**17, 2**18)]
+    assert sizes == [2, 252, 2**14, 2**14, 2**15]
     given = replace_fields(config, {"clustering.max_obstacles": 7, "box.max_slab_points": 5})
     assert (obstacle_capacity(given, NUM_ROWS), slab_capacity(given, NUM_ROWS)) == (7, 5)

@@ -35,6 +35,8 @@ class Capacity:
     """That sentence, in words."""
     share: fractions.Fraction | None = None
     """Of the cloud's capacity N: what None in the configuration stands for, rounded up."""
+    at_least: int = 0
+    """Or as many as this, up to twice the share: of sweeps with few points a larger part is needed."""
     only_if: tuple[str, Any] | None = None
     """A field and its value for which the capacity is used; None where it always is."""
 
@@ -66,7 +68,8 @@ class Capacity:
 
     def _share_of(self, num_rows: int) -> int:
         assert self.share is not None, f"{self.field} is None, and the table says no share of the cloud"
-        return math.ceil(self.share * num_rows)
+        size = math.ceil(self.share * num_rows)
+        return max(size, min(2 * size, self.at_least))
 
     def is_exceeded(self, counts: Any, config: DetectorConfig, num_rows: int) -> jax.Array:
         """Whether more was needed than it holds, on any map.
@@ -114,7 +117,8 @@ CAPACITIES = (
         status="OBSTACLE_OVERFLOW",
         overflow="boxes are fitted to more points of a map than box.max_slab_points, and the last in the "
         "sweep's order were dropped",
-        share=fractions.Fraction(1, 4),
+        share=fractions.Fraction(1, 8),
+        at_least=16384,
         only_if=("box.fit_to", "slab"),
     ),
     Capacity(

@@ -234,7 +234,8 @@ class BoxConfig:
     """static: M, points of a cluster that the rectangle is fitted to; of more about .8 M, spread evenly by
     their direction, the same in any order of the points."""
     max_slab_points: int | None = _static(default=None)
-    """static: capacity for points between the slab's heights; None is 1/4 of the cloud's capacity."""
+    """static: capacity for a map's points between the slab's heights; None is 1/8 of the cloud or, up to
+    1/4 of it, 16,384."""
     slab_min_height_m: Scalar = 0.2
     """Only points higher than this shape the rectangle: below are wheels and kerb."""
     slab_max_height_m: Scalar = 0.8
