@@ -33,7 +33,7 @@ WITHOUT_LAW = {
 
 
 def functions_in_tests():
-    """Names such as `rows.take` in the tests of the modules."""
+    """Names such as `rows.compact` in the tests of the modules."""
     for path in pathlib.Path(__file__).parent.glob("test_xla_*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):

@@ -27,8 +27,11 @@ def assert_same_tree(one, other):
 
 
 @pytest.mark.usefixtures("platform")
-def test_materialize_is_the_identity():
+def test_materialize_and_store_are_the_identity():
     assert_same_tree(jax.jit(functools.partial(barriers.materialize))(TREE), TREE)
+    assert_same_tree(jax.jit(functools.partial(barriers.store))(TREE), TREE)
+    values = np.arange(6.0).reshape(2, 3)
+    np.testing.assert_array_equal(jax.jit(jax.vmap(lambda v: barriers.store(2 * v)))(values), 2 * values)
 
 
 @pytest.mark.usefixtures("platform")

@@ -241,6 +241,8 @@ def test_window_sums_are_those_of_the_27_neighbours(sheets, levels, width, weigh
     for i, j, k in np.ndindex(3, 3, 3):
         part = cells[i : sheets - 2 + i, j : levels - 2 + j, k : width - 2 + k]
         expected += weight ** (abs(i - 1) + abs(j - 1) + abs(k - 1)) * part
+    at = jax.jit(functools.partial(grids.window_at))(sums, np.arange(sums.size // 4, dtype=np.uint32))
+    np.testing.assert_array_equal(at, np.reshape(sums, (-1, 4)))
     # The lines but for the margins of a grid whose sheets lie one after the other.
     assert sums.shape == (sheets * levels - 2 * levels - 2, 4 * width - 8)
     for i, j in np.ndindex(sheets - 2, levels - 2):

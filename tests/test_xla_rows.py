@@ -115,61 +115,6 @@ def test_rows_in_use_end_with_the_last_that_is_present(size):
         assert int(in_use(present)) == last + 1
 
 
-def test_take_reads_rows_and_fills_those_that_are_absent():
-    table = jnp.arange(12.0).reshape(4, 3)
-    picked = rows.take(table, jnp.array([[3, 0], [4, 99]]))
-    np.testing.assert_array_equal(picked, [[[9, 10, 11], [0, 1, 2]], [[0, 0, 0], [0, 0, 0]]])
-    filled = rows.take(jnp.array([5, 6]), jnp.array([2, 1]), -7)
-    assert filled.tolist() == [-7, 6]
-    assert filled.dtype == jnp.int32
-    assert rows.take(jnp.array([False, True]), jnp.array([1, 2])).tolist() == [True, False]
-
-
-@pytest.mark.usefixtures("platform")
-def test_take_after_compact_gathers_and_a_drop_scatter_puts_back():
-    mask = jnp.asarray(np.random.default_rng(2).random(50) < 0.4)
-    values = jnp.arange(50.0) + 1
-    index, _ = compact(mask, 64)
-    back = jnp.zeros(50).at[index].set(rows.take(values, index), mode="drop")
-    np.testing.assert_array_equal(back, jnp.where(mask, values, 0))
-
-
-@pytest.mark.parametrize("shape", [(1,), (7,), (5, 3), (1, 1, 1), (4, 6, 5)])
-@pytest.mark.parametrize("places", [(), (1,), (9,), (2, 4)])
-def test_lookup_is_what_numpy_indexes(shape, places):
-    rng = np.random.default_rng(len(shape))
-    table = rng.normal(size=shape).astype(np.float32)
-    index = [rng.integers(0, size, places, np.int32) for size in shape]
-    found = rows.lookup(jnp.asarray(table), *map(jnp.asarray, index))
-    assert found.shape == places
-    np.testing.assert_array_equal(found, table[tuple(index)])
-
-
-@pytest.mark.usefixtures("platform")
-@pytest.mark.parametrize("shape", [(7,), (5, 3), (4, 6, 5)])
-def test_the_same_entries_are_looked_up_in_each_table(shape):
-    rng = np.random.default_rng(len(shape))
-    tables = rng.normal(size=(3, *shape)).astype(np.float32)
-    index = [rng.integers(0, size, (2, 4), np.int32) for size in shape]
-    found = jax.jit(lambda tables, *index: rows.lookup_each(list(tables), *index))(tables, *index)
-    np.testing.assert_array_equal(found, tables[:, *index])
-
-
-@pytest.mark.usefixtures("platform")
-@pytest.mark.parametrize("num_places", [1, 200])
-def test_corners_are_the_entries_of_two_by_two_cells(num_places):
-    rng = np.random.default_rng(num_places)
-    table = rng.normal(size=(6, 9)).astype(np.float32)
-    i, j = (rng.integers(0, size - 1, num_places, np.int32) for size in table.shape)
-    i[-1], j[-1] = 4, 7
-    found = jax.jit(functools.partial(rows.lookup_corners))(table, i, j)
-    expected = [table[i, j], table[i, j + 1], table[i + 1, j], table[i + 1, j + 1]]
-    np.testing.assert_array_equal(found, expected)
-    tables = np.stack([table, -table])
-    batched = jax.jit(jax.vmap(rows.lookup_corners))(tables, np.stack([i, i]), np.stack([j, j]))
-    np.testing.assert_array_equal(batched, [(corner, -corner) for corner in expected])
-
-
 @pytest.mark.usefixtures("platform")
 def test_stored_columns_are_the_columns():
     table = np.random.default_rng(0).normal(size=(7, 3)).astype(np.float32)
@@ -184,18 +129,6 @@ def test_rows_that_are_not_kept_are_zeros_whatever_they_hold(density):
     values[~keep] = np.nan
     kept = jax.jit(functools.partial(rows.keep_rows))(values, keep)
     np.testing.assert_array_equal(kept, np.where(keep[:, None], values, 0))
-
-
-@pytest.mark.parametrize("size", [1, 2, 1000])
-@pytest.mark.parametrize("num_bits", [1, 14])
-def test_a_pair_is_looked_up_as_its_two_numbers(size, num_bits):
-    rng = np.random.default_rng(size)
-    number, small = (rng.integers(0, 2**bits, size, np.int32) for bits in (31 - num_bits, num_bits))
-    number[0], small[0], index = 2 ** (31 - num_bits) - 1, 2**num_bits - 1, rng.integers(0, size, (9, 7))
-    packed = rows.pack_pairs(jnp.asarray(number), jnp.asarray(small), num_bits)
-    found = rows.lookup_pair(packed, jnp.asarray(index, jnp.int32), num_bits)
-    np.testing.assert_array_equal(found[0], number[index])
-    np.testing.assert_array_equal(found[1], small[index])
 
 
 @pytest.mark.parametrize("size", [1, 2, 7, 2**20])

@@ -31,16 +31,20 @@ from jaxbox.xla import (
 @pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("num_maps", [1, 4, 5])
 @pytest.mark.parametrize("size", [1, 7, 300])
-def test_segments_have_the_maxima_and_sums_of_their_rows(num_maps, size):
+@pytest.mark.parametrize(("num_flags", "max_half"), [(1, 9), (2, 2**15 - 1), (2, 9), (3, 9)])
+def test_segments_have_the_maxima_and_counts_of_their_rows(num_maps, size, num_flags, max_half, monkeypatch):
+    # Two counts share a word as long as none can be too large for half of it.
+    monkeypatch.setattr(segments, "MAX_HALF", max_half)
     rng = np.random.default_rng(size)
     values, num_segments = rng.normal(size=(size, 2)).astype(np.float32), 9
-    flags = rng.random(size) < 0.5
+    flags = rng.random((size, num_flags)) < 0.5
     segment = rng.integers(0, num_segments, (num_maps, size), np.int32)
     rows = jnp.asarray(values), jnp.asarray(flags)
 
     def describe(row):
         values, flags = row
-        return [values[..., 0], -values[..., 1]], [flags.astype(jnp.float32)]
+        columns = [flags[..., k].astype(jnp.float32) for k in range(num_flags)]
+        return [values[..., 0], -values[..., 1]], columns
 
     reduce = jax.jit(
         lambda num: segments.reduce_segments(
@@ -49,11 +53,11 @@ def test_segments_have_the_maxima_and_sums_of_their_rows(num_maps, size):
     )
     for num in (0, 1, size // 2, size, size + 9):
         table = reduce(jnp.int32(num))
-        expected = np.tile(np.float32([-np.inf, -np.inf, 0]), (num_segments, 1))
+        expected = np.tile(np.float32([-np.inf, -np.inf, *[0] * num_flags]), (num_segments, 1))
         for of_map in segment:
             np.maximum.at(expected[:, 0], of_map[:num], values[:num, 0])
             np.maximum.at(expected[:, 1], of_map[:num], -values[:num, 1])
-            np.add.at(expected[:, 2], of_map[:num], flags[:num])
+            np.add.at(expected[:, 2:], of_map[:num], flags[:num])
         np.testing.assert_array_equal(table, expected)
 
 
@@ -466,6 +470,22 @@ def test_all_pairs_are_each_row_with_each_other_one():
     first, second = np.arange(6).reshape(3, 2), np.arange(10).reshape(5, 2)
     found = pairs.all_pairs(lambda a, b: a[0] - b[1], jnp.asarray(first), jnp.asarray(second))
     np.testing.assert_array_equal(found, first[:, None, 0] - second[None, :, 1])
+
+
+# Packed sums.
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("most", [[1], [1] * 5 + [320, 320], [2**27 - 1, 3], [1] * 40, [2**27 - 1] * 2])
+def test_sums_side_by_side_in_words_are_those_of_each(axis, most):
+    rng = np.random.default_rng(len(most))
+    counts = [rng.integers(0, each + 1, (32, 31), np.int32) for each in most]
+    counts[0][:] = most[0]
+    sums = bits.sum_packed([jnp.asarray(each) for each in counts], most, axis=axis)
+    assert len(sums) == len(most)
+    for found, each in zip(sums, counts, strict=True):
+        assert found.dtype == jnp.int32
+        np.testing.assert_array_equal(found.astype(np.uint32), each.sum(axis=axis, dtype=np.uint32))
 
 
 # Suppression.

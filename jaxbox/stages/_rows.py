@@ -6,8 +6,9 @@ import jax.numpy as jnp
 from jaxbox.config import ClassPrior, CompletionConfig
 from jaxbox.stages._assignments import Assignments
 from jaxbox.stages.state import RayFractions
+from jaxbox.xla.indexing import take
 from jaxbox.xla.pairs import join_pairs
-from jaxbox.xla.rows import compact, take
+from jaxbox.xla.rows import compact
 
 NARROWEST, WIDEST = 0.8, 1.15
 """The visible end of a vehicle is so wide, as a fraction of the class's width."""

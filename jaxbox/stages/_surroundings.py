@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxbox.config import ClassPrior, RegionConfig, VehicleConfig
 from jaxbox.stages.state import NeighbourhoodCounts, Obstacles
 from jaxbox.xla import chunks
+from jaxbox.xla.indexing import gather, scatter
 from jaxbox.xla.loops import map_rows
 from jaxbox.xla.rows import sum_after
 from jaxbox.xla.runs import count_kinds, fold_runs, maximum_nonnegative
@@ -85,7 +86,7 @@ def count_points_around(
     order, begin, end = sort_by_group(
         lambda i: i, cell_of_point, obstacles.count, shape[0] * shape[1], room=chunks.RUN_ROWS
     )
-    points = [jnp.take(values, order, mode="clip") for values in (xy[:, 0], xy[:, 1], obstacles.height)]
+    points = [gather(values, order) for values in (xy[:, 0], xy[:, 1], obstacles.height)]
 
     def prepare(rows: tuple[jax.Array, ...]) -> tuple[jax.Array, list[jax.Array], list[jax.Array]]:
         boxes, *others = rows
@@ -182,7 +183,7 @@ def _count_runs(
         state: tuple[jax.Array, jax.Array], box: jax.Array, valid: jax.Array, columns: list[jax.Array]
     ) -> tuple[jax.Array, jax.Array]:
         counts, greatest = _judge(frames[box], valid, columns, config)
-        return state[0].at[box].add(counts), state[1].at[box].max(greatest)
+        return scatter("add", state[0], box, counts), scatter("max", state[1], box, greatest)
 
     num_boxes = first.shape[0]
     none = jnp.zeros((num_boxes, NUM_KINDS + NUM_LEVELS), jnp.int32), jnp.zeros((num_boxes, 2), jnp.float32)

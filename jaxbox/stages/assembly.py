@@ -33,8 +33,9 @@ from jaxbox.types import (
 )
 from jaxbox.xla import chunks
 from jaxbox.xla.barriers import single_kernel
+from jaxbox.xla.indexing import lookup, scatter, take
 from jaxbox.xla.loops import fold_rows
-from jaxbox.xla.rows import count_each, lookup, map_selected, maximum, take
+from jaxbox.xla.rows import count_each, map_selected, maximum
 
 
 def assign_points(kept: Kept, obstacles: Obstacles, clusters: Clusters) -> Owners:
@@ -61,7 +62,7 @@ def assign_points(kept: Kept, obstacles: Obstacles, clusters: Clusters) -> Owner
         owner = jnp.full(xy.shape[0], num_detections, jnp.int32)
         for cluster in clusters:
             detection = lookup(of_cluster, cluster)
-            x, y, cos, sin, half_length, half_width = jnp.take(frame, detection, axis=0, mode="clip").T
+            x, y, cos, sin, half_length, half_width = (lookup(column, detection) for column in frame.T)
             dx, dy = xy[:, 0] - x, xy[:, 1] - y
             inside = jnp.abs(dx * cos + dy * sin) <= half_length
             inside = inside & (jnp.abs(dy * cos - dx * sin) <= half_width)
@@ -143,7 +144,7 @@ def assemble(
         descriptors=descriptors,
         ground=ground.plane,
         ground_mask=sweep.inlier & (ground.height <= config.ground.min_height_m),
-        point_component=nowhere.at[found.obstacles.row].set(found.clusters.component, mode="drop"),
+        point_component=scatter("set", nowhere, found.obstacles.row, found.clusters.component),
         point_detection=_claim_points(nowhere, owners, found.obstacles, kept.valid.shape[0]),
         first_return_m=first_return_m,
         status=status,
@@ -157,7 +158,7 @@ def _claim_points(nowhere: jax.Array, owners: Owners, obstacles: Obstacles, num_
     def claim(of_point: jax.Array, _: jax.Array, rows: tuple[jax.Array, jax.Array]) -> jax.Array:
         index, owner = rows
         row = take(obstacles.row, index, obstacles.num_rows)
-        return of_point.at[row].set(jnp.where(owner < num_detections, owner, -1), mode="drop")
+        return scatter("set", of_point, row, jnp.where(owner < num_detections, owner, -1))
 
     absent = owners.row.shape[0], num_detections
     return fold_rows(claim, nowhere, (owners.row, owners.owner), num_rows=owners.num, absent=absent)

@@ -12,9 +12,10 @@ from jaxbox.stages.state import Clusters, Obstacles
 from jaxbox.xla.arithmetic import arctan2
 from jaxbox.xla.components import NONE, CellGrids, label_components
 from jaxbox.xla.hashing import lattice_numbers
+from jaxbox.xla.indexing import lookup_pair, pack_pairs, take
 from jaxbox.xla.loops import map_rows
 from jaxbox.xla.maps import flag_cells, map_tables
-from jaxbox.xla.rows import compact, lookup_pair, pack_pairs, stored_columns, take
+from jaxbox.xla.rows import compact, stored_columns
 from jaxbox.xla.segments import reduce_segments, segment_minima
 from jaxbox.xla.sorting import compact_groups
 

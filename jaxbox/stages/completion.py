@@ -38,9 +38,10 @@ from jaxbox.stages.state import (
 )
 from jaxbox.xla import chunks
 from jaxbox.xla.arithmetic import fast_max, fast_min
+from jaxbox.xla.indexing import take
 from jaxbox.xla.loops import fold_rows, map_rows
 from jaxbox.xla.ragged import PointLists, fold_points
-from jaxbox.xla.rows import compact, first_argmax, split_index, take
+from jaxbox.xla.rows import compact, first_argmax, split_index
 from jaxbox.xla.sorting import sort_by_group
 
 INSIDE_MARGIN_M = 0.1

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 
 from jaxbox.stages.state import Kept, Owners
 from jaxbox.types import Descriptors, Hulls
+from jaxbox.xla.indexing import take
 from jaxbox.xla.loops import map_rows
-from jaxbox.xla.rows import take
 from jaxbox.xla.segments import fold_segments
 
 MIN_VARIANCE = 1e-6
@@ -54,8 +54,8 @@ def point_moments(
     """
 
     def powers(slot: jax.Array, row: jax.Array) -> jax.Array:
-        d = take(xy, row) - take(origin, slot)
-        x, y = d[:, :1], d[:, 1:]
+        point, at = take(xy, row), take(origin, slot)
+        x, y = point[:, :1] - at[:, :1], point[:, 1:] - at[:, 1:]
         return jnp.concatenate([jnp.ones_like(x), x, y, x * x, y * y, x * y], axis=1)
 
     size = origin.shape[0]

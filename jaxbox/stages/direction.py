@@ -11,8 +11,9 @@ from jaxbox.stages._assignments import NUM_ASSIGNMENTS, assign_length_axis, exte
 from jaxbox.stages._priors import prior_of, size_score
 from jaxbox.stages.state import NOT_A_BOX, Boxes, CastRays, Clusters, RayFractions, Rectangles, longest_side
 from jaxbox.xla import chunks
+from jaxbox.xla.indexing import take
 from jaxbox.xla.loops import fold_rows, map_rows
-from jaxbox.xla.rows import compact, rows_in_use, take
+from jaxbox.xla.rows import compact, rows_in_use
 
 VOTE_POINTS, VOTE_EXTENT_M = 150.0, 6.0
 """A vote for the scene's direction counts min(points, 150) x min(extent, 6 m) x the score as a car."""

@@ -12,9 +12,11 @@ from jaxbox.stages._grids import sum_of_neighbours
 from jaxbox.stages.state import Boxes, Evidence, FlatBoxes, Ground, GroundElevation, RayFractions, Sweep
 from jaxbox.xla import chunks
 from jaxbox.xla.arithmetic import arctan2, cos_sin
+from jaxbox.xla.bits import sum_packed
+from jaxbox.xla.indexing import lookup, scatter
 from jaxbox.xla.loops import apply_in_turn, fast_axis, map_rows
 from jaxbox.xla.range_bits import draw_beams, next_set, set_before, words_at
-from jaxbox.xla.rows import lookup, sum_after
+from jaxbox.xla.rows import sum_after
 
 SUPPORT_HALF_M = 100.0
 """The ground support grid covers |x|, |y| below this, in cells of 1 m."""
@@ -166,7 +168,7 @@ def steepest_beam(z: jax.Array, rho: jax.Array, mask: jax.Array) -> jax.Array:
     level = jnp.floor((z / jnp.maximum(rho, STEEP_FROM_M) - LEAST_RISE) * RISES_PER_UNIT).astype(jnp.int32)
     counted = mask & (rho > STEEP_FROM_M) & (level >= 0)
     place = jnp.where(counted, jnp.minimum(level, NUM_RISES - 1), NUM_RISES)
-    count = jnp.zeros(NUM_RISES, jnp.int32).at[place].add(1, mode="drop").astype(jnp.float32)
+    count = scatter("add", jnp.zeros(NUM_RISES, jnp.int32), place, 1).astype(jnp.float32)
     higher = sum_after(count[None])[0]
     share = jnp.clip((NUM_STEEPEST - higher) / jnp.maximum(count, 1), 0, 1)
     top = jnp.arange(1, NUM_RISES + 1, dtype=jnp.float32) - share
@@ -215,7 +217,7 @@ def _ground_support(
     i, j = (jnp.clip(jnp.floor(xyz[:, a] + SUPPORT_HALF_M).astype(jnp.int32), 0, n - 1) for a in (0, 1))
     on_ground = mask & (jnp.abs(height) < support_height_m)
     place = jnp.where(on_ground, i * n + j, n * n)
-    count = jnp.zeros(n * n, jnp.int32).at[place].add(1, mode="drop").reshape(n, n)
+    count = scatter("add", jnp.zeros(n * n, jnp.int32), place, 1).reshape(n, n)
     for axis in (0, 1):
         count = sum_of_neighbours(count, axis, SUPPORT_REACH)
     return count.astype(jnp.float32)
@@ -265,8 +267,8 @@ def cast_rays(evidence: Evidence, boxes: FlatBoxes, config: EvidenceConfig, *, n
         ],
         (center, length / 2, width / 2, yaw),
     )
-    # Counts of rays in float32, which are exact.
-    sums = (jnp.sum(a, axis=axis, dtype=jnp.float32).reshape(shape) for a in met)
+    most = *[1] * 5, evidence.num_ranges, evidence.num_ranges
+    sums = (a.astype(jnp.float32).reshape(shape) for a in sum_packed(met, most, axis=axis))
     hit, free, deep, is_open, crosses, free_cells, cells = sums
     total = jnp.maximum(crosses, 1)
     return RayFractions(

@@ -8,7 +8,7 @@ from jaxbox.config import FilterConfig, RegionConfig
 from jaxbox.stages.state import Sweep
 from jaxbox.types import PointCloud
 from jaxbox.xla import chunks
-from jaxbox.xla.grids import map_cells, sum_cells, window_sums
+from jaxbox.xla.grids import map_cells, sum_cells, window_at, window_sums
 from jaxbox.xla.rows import keep_rows, masked_mean, masked_std
 
 MAX_ABS_Z_M = 100.0
@@ -87,8 +87,7 @@ def filter_outliers(xyz1: jax.Array, config: FilterConfig, region: RegionConfig)
     windows = window_sums(sums.reshape(-1, 4 * width), stride, weight)
 
     def window_of(cell: jax.Array) -> jax.Array:
-        row = (cell // width - margin) * (width - 2) + cell % width - 1
-        return windows.reshape(-1, 4).at[row].get(mode="clip")
+        return window_at(windows, (cell // width - margin) * (width - 2) + cell % width - 1)
 
     def shift(cell: jax.Array) -> jax.Array:
         """Where the points of a cell end; infinitely far if their window is too light."""

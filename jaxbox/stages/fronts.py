@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxbox.config import Label
 from jaxbox.geometry.planar import wrap_turn
 from jaxbox.stages.state import Kept, Obstacles, Owners
+from jaxbox.xla.indexing import take
 from jaxbox.xla.loops import map_rows
-from jaxbox.xla.rows import take
 from jaxbox.xla.segments import reduce_segments
 
 NUM_PARTS = len(Label.CAR.front_profile)
@@ -67,7 +67,8 @@ def profile_tops(owners: Owners, obstacles: Obstacles, kept: Kept) -> jax.Array:
     def place(rows: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         row, owner = rows
         box = take(frame, owner)
-        share = jnp.sum((take(obstacles.xy, row) - box[:, :2]) * box[:, 2:], axis=1) + 0.5
+        point, (x, y, to_x, to_y) = take(obstacles.xy, row), box.T
+        share = (point[:, 0] - x) * to_x + (point[:, 1] - y) * to_y + 0.5
         part = jnp.clip(jnp.floor(share * NUM_PARTS).astype(jnp.int32), 0, NUM_PARTS - 1)
         return owner * NUM_PARTS + part, take(obstacles.height, row)
 

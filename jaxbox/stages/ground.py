@@ -16,11 +16,13 @@ from jaxbox.stages._sheets import on_sheets
 from jaxbox.stages.state import Ground, Obstacles, Sweep
 from jaxbox.types import GroundPlane
 from jaxbox.xla import chunks
+from jaxbox.xla.barriers import store
 from jaxbox.xla.grids import margin_cells, window_counts
 from jaxbox.xla.hashing import hashed_uniform
+from jaxbox.xla.indexing import lookup, lookup_corners, take
 from jaxbox.xla.least_squares import refit_plane
 from jaxbox.xla.loops import apply_in_turn, map_batches, repeat
-from jaxbox.xla.rows import compact, count_true, lookup, lookup_corners, maximum, take
+from jaxbox.xla.rows import compact, count_true, maximum
 from jaxbox.xla.segments import segment_minima
 
 FAR_FILL_WIDTH = 4
@@ -96,7 +98,8 @@ def gather_obstacles(sweep: Sweep, ground: Ground, config: DetectorConfig) -> Ob
     between = (ground.height > low_m) & (ground.height < high_m)
     row, count = compact(sweep.inlier & between, obstacle_capacity(config, sweep.xyz.shape[0]))
     xyz, height = take(sweep.xyz, row), take(ground.height, row)
-    return Obstacles(row, xyz[:, :2], xyz[:, 2], height, count, sweep.xyz.shape[0])
+    *xy, z, height = store((*xyz.T, height))
+    return Obstacles(row, jnp.stack(xy, axis=1), z, height, count, sweep.xyz.shape[0])
 
 
 def height_above_ground(

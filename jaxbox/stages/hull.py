@@ -10,9 +10,10 @@ from jaxbox.stages.state import Clusters, Kept, Obstacles, Outlines, Owners
 from jaxbox.types import Hulls
 from jaxbox.xla import chunks
 from jaxbox.xla.hulls import lower_hulls
+from jaxbox.xla.indexing import lookup_each, scatter, take
 from jaxbox.xla.loops import fold_rows, map_rows
 from jaxbox.xla.ragged import PointLists, list_points
-from jaxbox.xla.rows import compact, lookup_each, take
+from jaxbox.xla.rows import compact
 from jaxbox.xla.segments import argmax_key, argmax_row, fold_segments
 
 MIN_EXTENT_M = 1e-6
@@ -193,8 +194,8 @@ def extreme_points(
     ) -> list[jax.Array]:
         slot, row = rows
         # Where each point lies between the least and the greatest of its cluster, in [0, 1].
-        place = (take(xy, row) - take(frame[:, :2], slot)) * take(frame[:, 2:], slot)
-        x, y = jnp.clip(place[:, 0], 0, 1), jnp.clip(place[:, 1], 0, 1)
+        point, (low_x, low_y, per_x, per_y) = take(xy, row), take(frame, slot).T
+        x, y = jnp.clip((point[:, 0] - low_x) * per_x, 0, 1), jnp.clip((point[:, 1] - low_y) * per_y, 0, 1)
         directions = ((x, y), (x, 1 - y), (y, x), (y, 1 - x))
         new = []
         for before, (along, across) in zip(best, directions, strict=True):
@@ -202,7 +203,7 @@ def extreme_points(
             key = argmax_key(across, index, num_listed)
             # Beyond the table where the point has no cluster.
             cell = jnp.where(slot < num_clusters, piece * num_clusters + slot, num_slices * num_clusters)
-            new.append(before.at[cell].max(key, mode="drop"))
+            new.append(scatter("max", before, cell, key))
         return new
 
     none = [jnp.zeros(num_slices * num_clusters, jnp.uint32)] * 4

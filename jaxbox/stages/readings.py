@@ -15,7 +15,8 @@ from jaxbox.config import DetectorConfig, RegionConfig
 from jaxbox.geometry.planar import rotate, wrap_turn, wrap_yaw
 from jaxbox.stages._suppression import non_max_suppression
 from jaxbox.types import Counts, Detections, PointCloud, combine_bits
-from jaxbox.xla.rows import compact, take
+from jaxbox.xla.indexing import take
+from jaxbox.xla.rows import compact
 from jaxbox.xla.sorting import best_first
 
 TURN_DEG = 7.3

@@ -12,9 +12,10 @@ from jaxbox.config import BoxConfig, DetectorConfig, Scalar
 from jaxbox.stages.state import Outlines, Rectangles, Rotations
 from jaxbox.xla import chunks
 from jaxbox.xla.arithmetic import fast_max, fast_min
+from jaxbox.xla.indexing import take
 from jaxbox.xla.loops import map_rows
 from jaxbox.xla.ragged import PointLists, PointTable, fold_points
-from jaxbox.xla.rows import first_argmax, take
+from jaxbox.xla.rows import first_argmax
 from jaxbox.xla.sorting import largest_first
 
 PREFERENCE_GAIN = 5.0

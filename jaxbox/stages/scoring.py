@@ -28,8 +28,9 @@ from jaxbox.stages.state import (
     RayFractions,
 )
 from jaxbox.xla import chunks
+from jaxbox.xla.indexing import take
 from jaxbox.xla.loops import map_rows
-from jaxbox.xla.rows import compact, take
+from jaxbox.xla.rows import compact
 from jaxbox.xla.sorting import best_first, select_highest
 
 PSEUDO_COUNT = 5

@@ -34,6 +34,23 @@ def materialize(values: Any) -> Any:
     return jax.lax.while_loop(lambda state: state[0], turn, (never, values))[1]
 
 
+def store(values: Any) -> Any:
+    """Has an accelerator store values once, where XLA would compute them in each of several readers.
+
+    Law: the identity.
+
+    For what is made of much more than it is, as sums of many tables are, or is read by many, as coordinates
+    are. It takes no loop there; on a CPU nothing is done, see `materialize`.
+
+    Args:
+      values: pytree of arrays.
+
+    Returns:
+      The values.
+    """
+    return jax.lax.optimization_barrier(values) if on_accelerator() else values
+
+
 def opaque_zeros(*shape: int) -> jax.Array:
     """Zeros that the compiler does not know to be zeros. Law: `jnp.zeros`.
 

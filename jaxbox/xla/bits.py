@@ -79,3 +79,39 @@ def lowest_bit(words: jax.Array) -> jax.Array:
       (...) uint32, in [0, 32).
     """
     return jax.lax.population_count((words & -words) - 1)
+
+
+def sum_packed(counts: Sequence[jax.Array], most: Sequence[int], *, axis: int) -> list[jax.Array]:
+    """Sums of several small counts along an axis, side by side in words. Law: `jnp.sum` of each.
+
+    Args:
+      counts: (...) bool or int32 each, not negative.
+      most: static, the greatest that each may be; no sum takes more than 32 bits.
+      axis: static.
+
+    Returns:
+      int32 each.
+
+    >>> [int(each) for each in sum_packed([jnp.array([1, 0, 1]), jnp.array([7, 5, 0])], [1, 7], axis=0)]
+    [2, 12]
+    """
+    widths = [(each * counts[0].shape[axis]).bit_length() for each in most]
+    sums = []
+    for word in _fitting(widths):
+        places = [sum(widths[word.start : k]) for k in word]
+        packed = [_bit(counts[k], jnp.uint32(place)) for k, place in zip(word, places, strict=True)]
+        total = jnp.sum(functools.reduce(jnp.bitwise_or, packed), axis=axis, dtype=jnp.uint32)
+        sums += [
+            total >> place & jnp.uint32(2 ** widths[k] - 1) for k, place in zip(word, places, strict=True)
+        ]
+    return [each.astype(jnp.int32) for each in sums]
+
+
+def _fitting(widths: Sequence[int]) -> list[range]:
+    """Neighbours that fit into a word each, by their number."""
+    words, first = [], 0
+    for k in range(len(widths)):
+        if sum(widths[first : k + 1]) > WORD_BITS:
+            words.append(range(first, k))
+            first = k
+    return [*words, range(first, len(widths))]

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jaxbox.xla.backend import on_accelerator
 from jaxbox.xla.barriers import materialize, single_kernel
 from jaxbox.xla.bits import WORD_BITS, count_bits, pack_bits
-from jaxbox.xla.rows import lookup, prefix_sum, take
+from jaxbox.xla.indexing import gather, lookup, scatter, take
+from jaxbox.xla.rows import prefix_sum
 
 STRIP_WORDS = 32
 """R, words of a strip of consecutive cells. The strips lie side by side in tables (R, S), so that sums along
@@ -204,14 +205,14 @@ def _place(cell: jax.Array, num_strips: int) -> Place:
 
 def _is_set(words: jax.Array, place: Place) -> jax.Array:
     word, bit = place
-    return jnp.take(words, word, mode="clip") >> bit & 1 == 1
+    return gather(words.reshape(-1), word) >> bit & 1 == 1
 
 
 def _run_at(starts: jax.Array, runs_before: jax.Array, place: Place) -> jax.Array:
     """The last run that starts at a cell or before it."""
     word, bit = place
-    up_to = jnp.take(starts, word, mode="clip") & ((jnp.uint32(2) << bit) - 1)
-    return jnp.take(runs_before, word, mode="clip") + count_bits(up_to) - 1
+    up_to = gather(starts.reshape(-1), word) & ((jnp.uint32(2) << bit) - 1)
+    return gather(runs_before.reshape(-1), word) + count_bits(up_to) - 1
 
 
 def _starting_cells(starts: jax.Array, runs_before: jax.Array, size: int) -> jax.Array:
@@ -220,13 +221,13 @@ def _starting_cells(starts: jax.Array, runs_before: jax.Array, size: int) -> jax
     strip, word = jnp.arange(strips, dtype=jnp.int32)[None], jnp.arange(words, dtype=jnp.int32)[:, None]
     cell = strip * STRIP + word * WORD_BITS
     first = jnp.where(starts > 0, runs_before, size)
-    cell = jnp.zeros(size, jnp.int32).at[first.reshape(-1)].set(cell.reshape(-1), mode="drop")
+    cell = scatter("set", jnp.zeros(size, jnp.int32), first.reshape(-1), cell.reshape(-1))
     # The first run of each word knows where the word begins; its other runs come next.
     for step in (1, 2, 4, 8):
         cell = jnp.maximum(cell, jnp.pad(cell, (step, 0))[:size])
     word, _ = _place(cell, strips)
-    rank = jnp.arange(size, dtype=jnp.int32) - jnp.take(runs_before, word, mode="clip")
-    bits = jnp.take(starts, word, mode="clip")
+    rank = jnp.arange(size, dtype=jnp.int32) - gather(runs_before.reshape(-1), word)
+    bits = gather(starts.reshape(-1), word)
     for k in range(MAX_STARTS - 1):
         bits = jnp.where(rank > k, bits & (bits - 1), bits)
     return cell + count_bits((bits & -bits) - 1)
@@ -323,7 +324,7 @@ def _join_in_rounds(row: CellGrids, runs: _Runs) -> jax.Array:
 
     def hook(parent: jax.Array) -> jax.Array:
         pair = lookup(parent, node), lookup(parent, other)
-        return _jump(parent.at[jnp.maximum(*pair)].min(jnp.minimum(*pair)))
+        return _jump(scatter("min", parent, jnp.maximum(*pair), jnp.minimum(*pair)))
 
     def hooks(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         parent, _ = state

@@ -2,14 +2,15 @@
 
 import functools
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import jax
 import jax.numpy as jnp
 
 from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
-from jaxbox.xla.barriers import materialize
+from jaxbox.xla.barriers import materialize, store
+from jaxbox.xla.indexing import gather, scatter
 from jaxbox.xla.loops import for_chunks
 from jaxbox.xla.rows import compact
 
@@ -30,6 +31,8 @@ def sum_cells(
     """
     cells = materialize(cell_of(rows))
     zeros = jnp.zeros((num_cells, rows.shape[1]), rows.dtype)
+    if on_accelerator():
+        return cells, scatter("add", zeros, cells.astype(jnp.int32), rows)
     return cells, zeros.at[cells].add(rows, mode="promise_in_bounds")
 
 
@@ -118,7 +121,7 @@ def window_counts(
     size, before = (shape[0] + 1) * width, width + 1
     length = (num_levels + num_above) * size + 2 * before
     place = jnp.where(valid, level * size + cell + before, length)
-    count = jnp.zeros(length, jnp.int32).at[place].add(1, mode="drop")
+    count = scatter("add", jnp.zeros(length, jnp.int32), place, 1)
     for step in (width, 1):
         count = count[: -2 * step] + count[step:-step] + count[2 * step :]
     return materialize(count.reshape(-1, size).astype(jnp.float32))
@@ -149,14 +152,36 @@ def window_sums(sums: jax.Array, stride: int, weight: jax.Array) -> jax.Array:
       (lines - 2 stride - 2, 4 width - 8) float32.
     """
     if on_accelerator():
-        # Both passes over whole lines of cells in one kernel.
-        size = sums.shape[0] - 2 * (stride + 1)
-        corners = itertools.product((0, 1, 2), repeat=2)
-        starts = [(i * stride + k, weight ** (abs(i - 1) + abs(k - 1))) for i, k in corners]
-        sums = functools.reduce(jnp.add, [each * sums[start : start + size] for start, each in starts])
-    else:
-        for step in (stride, 1):
-            sums = sums[step:-step] + weight * (sums[: -2 * step] + sums[2 * step :])
-        # Stored, or each of three neighbours would add the same nine cells up.
-        sums = materialize(sums)
+        # All passes in one kernel, which reads and writes the cells once.
+        size = sums.shape[0] - 2 * (stride + 1), sums.shape[1] - 8
+        return store(functools.reduce(jnp.add, _neighbours(sums, stride, weight, size)))
+    for step in (stride, 1):
+        sums = sums[step:-step] + weight * (sums[: -2 * step] + sums[2 * step :])
+    # Stored, or each of three neighbours would add the same nine cells up.
+    sums = materialize(sums)
     return sums[:, 4:-4] + weight * (sums[:, :-8] + sums[:, 8:])
+
+
+def _neighbours(
+    sums: jax.Array, stride: int, weight: jax.Array, size: tuple[int, int]
+) -> Iterator[jax.Array]:
+    """The weighted sums of each of 3 x 3 x 3 neighbours, (lines, 4 width) of a size each."""
+    for x, level, y in itertools.product((0, 1, 2), repeat=3):
+        neighbour = jax.lax.slice(sums[x * stride + level :, 4 * y :], (0, 0), size)
+        yield weight ** (abs(x - 1) + abs(level - 1) + abs(y - 1)) * neighbour
+
+
+def window_at(windows: jax.Array, cell: jax.Array) -> jax.Array:
+    """The four numbers of cells. Law: ``windows.reshape(-1, 4)[cell]``.
+
+    Args:
+      windows: (lines, 4 width) float32, see `window_sums`.
+      cell: (...) uint32 or int32.
+
+    Returns:
+      (..., 4) float32.
+    """
+    if not on_accelerator():
+        return windows.reshape(-1, 4).at[cell].get(mode="clip")
+    first, numbers = 4 * cell.astype(jnp.int32), windows.reshape(-1)
+    return jnp.stack([gather(numbers, first + k) for k in range(4)], axis=-1)

@@ -11,6 +11,7 @@ from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
 from jaxbox.xla.barriers import materialize
 from jaxbox.xla.components import NONE, CellGrids
+from jaxbox.xla.indexing import scatter
 from jaxbox.xla.loops import for_chunks, whole_chunks
 
 
@@ -65,7 +66,7 @@ def _flag(flags: jax.Array, cell: jax.Array, cells: CellGrids) -> jax.Array:
 
     Rows that have no cell flag none: atomic updates of one address are serialized.
     """
-    return flags.at[jnp.where(cell == NONE, cells.num_flags, cells.flag(cell))].set(1, mode="drop")
+    return scatter("set", flags, jnp.where(cell == NONE, cells.num_flags, cells.flag(cell)), 1)
 
 
 def map_tables(

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
 from jaxbox.xla.barriers import materialize
-from jaxbox.xla.rows import take
+from jaxbox.xla.indexing import gather, take
 from jaxbox.xla.sorting import sort_by_group
 
 PointTable = tuple[jax.Array, jax.Array, jax.Array]
@@ -57,7 +57,7 @@ class PointLists:
         if on_accelerator():
             # Cluster by cluster, as the points lie in the lists and as `fold_points` reads them there.
             row = self._row(start[:, None], total[:, None], index[None])
-            xy = jnp.take(jnp.stack([self.x, self.y], axis=1), row, axis=0, mode="clip")
+            xy = gather(jnp.stack([self.x, self.y], axis=1), row)
             x, y = xy[:, :, 0].T, xy[:, :, 1].T
         else:
             # Stored, since what a look-up has to work out first does not vectorise.
@@ -67,7 +67,10 @@ class PointLists:
 
     def _row(self, start: jax.Array, total: jax.Array, j: jax.Array) -> jax.Array:
         """The row of the j-th point that is looked at of each cluster."""
-        spread = j * (total // self.max_points) + j * (total % self.max_points) // self.max_points
+        # floor(j total / M). The remainder's part by a product, exact up to M = 1,600: an accelerator would
+        # store what a division makes.
+        rest = (j * (total % self.max_points)).astype(jnp.float32) + 0.5
+        spread = j * (total // self.max_points) + (rest * (1 / self.max_points)).astype(jnp.int32)
         return start + jnp.where(total > self.max_points, spread, j)
 
 
@@ -99,7 +102,7 @@ def list_points(
         return x, y
 
     def read_pair(i: jax.Array) -> jax.Array:
-        return jnp.take(xy, row[i], axis=0, mode="clip")
+        return gather(xy, gather(row, i))
 
     columns = xy[:, 0], xy[:, 1]
     if on_accelerator():

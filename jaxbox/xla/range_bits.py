@@ -10,7 +10,7 @@ import numpy as np
 from jaxbox.xla.backend import on_accelerator
 from jaxbox.xla.barriers import materialize
 from jaxbox.xla.bits import count_bits, join_bits, lowest_bit
-from jaxbox.xla.rows import lookup
+from jaxbox.xla.indexing import lookup, scatter
 
 BLOCK_BITS = 4
 
@@ -37,7 +37,7 @@ def count_changes(size: int, first: jax.Array, last: jax.Array) -> jax.Array:
     beams, ends = jnp.zeros(size, jnp.int32), (first, last)
     if on_accelerator():
         # One scatter reads and writes the cells once, which counts in a batch.
-        return beams.at[jnp.stack(ends)].add(jnp.array([[1], [-1]], jnp.int32), mode="drop")
+        return scatter("add", beams, jnp.stack(ends), jnp.array([[1], [-1]], jnp.int32))
     return beams.at[ends[0]].add(1, mode="drop").at[ends[1]].add(-1, mode="drop")
 
 
@@ -73,7 +73,7 @@ def draw_beams(
         return jnp.where(valid, cell * num_columns + column, size)
 
     is_free, first, last = free
-    hits = jnp.zeros(size, bool).at[place(*hit)].set(True, mode="drop")
+    hits = scatter("set", jnp.zeros(size, bool), place(*hit), True)
     beams = count_changes(size, place(is_free, first), place(is_free, last))
     return covered_words(beams.reshape(shape)), next_words(hits.reshape(shape))
 

@@ -1,11 +1,10 @@
-"""Rows at a fixed shape: compaction, prefix sums, counts, look-ups, masked statistics.
+"""Rows at a fixed shape: compaction, prefix sums, counts, masked statistics.
 
-A row that is absent is marked by the sentinel index N, one past the last; `take` reads zeros there and
-scatters with ``mode="drop"`` ignore it.
+A row that is absent is marked by the sentinel index N, one past the last: see `jaxbox.xla.indexing`.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -14,8 +13,9 @@ import numpy as np
 
 from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
-from jaxbox.xla.barriers import materialize
+from jaxbox.xla.barriers import materialize, store
 from jaxbox.xla.bits import WORD_BITS, count_bits, pack_bits
+from jaxbox.xla.indexing import scatter, take
 from jaxbox.xla.loops import for_chunks, map_rows
 
 
@@ -172,8 +172,7 @@ def _compact_parallel(mask: jax.Array, capacity: int) -> tuple[jax.Array, jax.Ar
     order = prefix_sum(mask)
     target = jnp.where(mask, order - 1, capacity)
     index = jnp.full(capacity, mask.size, jnp.int32)
-    index = index.at[target].set(jnp.arange(mask.size, dtype=jnp.int32), mode="drop")
-    return index, order[-1]
+    return scatter("set", index, target, jnp.arange(mask.size, dtype=jnp.int32)), order[-1]
 
 
 def _compact_sequential(mask: jax.Array, num: jax.Array, capacity: int) -> tuple[jax.Array, jax.Array]:
@@ -220,6 +219,10 @@ def keep_rows(rows: jax.Array, keep: jax.Array) -> jax.Array:
     Returns:
       (N, C), stored once for all that read it.
     """
+    if on_accelerator():
+        # Column by column: most readers ask for one or two.
+        columns = [jnp.where(keep, rows[:, k], 0) for k in range(rows.shape[1])]
+        return jnp.stack(store(columns), axis=1)
     return materialize(jnp.where(keep[:, None], rows, 0))
 
 
@@ -235,112 +238,6 @@ def stored_columns(rows: jax.Array) -> tuple[jax.Array, ...]:
       C of (N,).
     """
     return materialize(tuple(rows[:, k] for k in range(rows.shape[1])))
-
-
-def take(rows: jax.Array, index: jax.Array, fill: Any = 0) -> jax.Array:
-    """Rows at the indices, and a fill at the sentinel or any beyond. Law: ``rows[i] if i < N else fill``.
-
-    Args:
-      rows: (N, ...).
-      index: (...) int32, not negative.
-      fill: what an absent row holds.
-
-    Returns:
-      (..., ...) of the type of `rows`.
-    """
-    return rows.at[index].get(mode="fill", fill_value=fill)
-
-
-def lookup(table: jax.Array, *index: jax.Array) -> jax.Array:
-    """Entries of a table at indices that are known to lie inside. Law: ``table[index]``.
-
-    One flat index: several would first be joined to rows, which costs more than the look-up (XLA, CPU). A
-    single entry is looked up as it is, since a loop that has another view of a table is not a native one.
-
-    Args:
-      table: (A, B, ...), as many axes as there are indices.
-      *index: int32 arrays of one shape, each within its axis.
-
-    Returns:
-      The shape of the indices.
-    """
-    if index[0].size == 1 and table.ndim > 1:
-        return table.at[index].get(mode="clip")
-    flat = index[0]
-    for size, along in zip(table.shape[1:], index[1:], strict=True):
-        flat = flat * size + along
-    return jnp.take(table.reshape(-1), flat, mode="clip")
-
-
-def lookup_each(tables: Sequence[jax.Array], *index: jax.Array) -> list[jax.Array]:
-    """Looks up the same entries of several tables. Law: ``[table[index] for table in tables]``.
-
-    The indices are stored before the look-ups, and so is what those find: on a CPU what a look-up has to work
-    out first does not vectorise, nor does what comes of it.
-
-    Args:
-      tables: arrays of one shape, see `lookup`.
-      *index: int32 arrays of one shape, each within its axis.
-
-    Returns:
-      The shape of the indices, of each table.
-    """
-    index = materialize(index)
-    return materialize([lookup(table, *index) for table in tables])
-
-
-def lookup_corners(table: jax.Array, i: jax.Array, j: jax.Array) -> tuple[jax.Array, ...]:
-    """The entries of 2 x 2 cells, row by row. Law: ``table[i + k, j + l]`` for k and l of 0 and 1.
-
-    For many look-ups on a CPU, each corner has a table of its own, so that all have one place.
-
-    Args:
-      table: (A, B).
-      i: (...) int32, in [0, A - 1).
-      j: (...) int32, in [0, B - 1).
-
-    Returns:
-      (...) each.
-    """
-    width = table.shape[1]
-    if on_accelerator() or i.size < table.size:
-        return tuple(lookup(table, i + down, j + right) for down in (0, 1) for right in (0, 1))
-    flat, place = table.reshape(-1), i * width + j
-    corners = materialize([jnp.roll(flat, -first) for first in (0, 1, width, width + 1)])
-    return tuple(lookup(corner, place) for corner in corners)
-
-
-def pack_pairs(number: jax.Array, small: jax.Array, num_bits: int) -> jax.Array:
-    """Packs two numbers in one word, so that one look-up finds both. Law: see `lookup_pair`.
-
-    Args:
-      number: (N,) int32, in [0, 2^(31 - num_bits)).
-      small: (N,) int32, in [0, 2^num_bits).
-      num_bits: static.
-
-    Returns:
-      (N,) int32.
-    """
-    return (number << num_bits) + small
-
-
-def lookup_pair(pairs: jax.Array, index: jax.Array, num_bits: int) -> tuple[jax.Array, jax.Array]:
-    """Numbers that `pack_pairs` packed. Law: ``number[index], small[index]``.
-
-    Args:
-      pairs: (N,) int32.
-      index: (...) int32, in [0, N).
-      num_bits: static, as they were packed.
-
-    Returns:
-      (...) int32 each.
-
-    >>> pairs = pack_pairs(jnp.array([5, 7]), jnp.array([1, 0]), 1)
-    >>> [part.tolist() for part in lookup_pair(pairs, jnp.array([1, 0]), 1)]
-    [[7, 5], [0, 1]]
-    """
-    found = lookup(pairs, index)
-    return found >> num_bits, found & (2**num_bits - 1)
 
 
 def split_index(index: jax.Array, size: int) -> tuple[jax.Array, jax.Array]:

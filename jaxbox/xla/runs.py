@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
 from jaxbox.xla.barriers import materialize
+from jaxbox.xla.indexing import scatter
 from jaxbox.xla.loops import for_chunks
 from jaxbox.xla.rows import prefix_max, prefix_sum, split_index
 
@@ -56,7 +57,7 @@ def fold_runs(
         is_met = (num_blocks > 0) & (end > place[0]) & (begin <= place[-1])
         at = jnp.where(is_met, jnp.maximum(begin - place[0], 0), num_places)
         index = jnp.arange(end.shape[0], dtype=jnp.int32)
-        run = prefix_max(jnp.zeros(num_places, jnp.int32).at[at].max(index, mode="drop"))
+        run = prefix_max(scatter("max", jnp.zeros(num_places, jnp.int32), at, index))
         offset = (place - begin[run]) * chunks.RUN_ROWS
         left = jnp.where(place < end[-1], length[run] - offset, 0)
         owner, _ = split_index(run, runs)

@@ -1,6 +1,7 @@
 """Reductions of rows by segment: by component, by cell, by slice."""
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
@@ -10,11 +11,17 @@ import numpy as np
 
 from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.barriers import store
 from jaxbox.xla.bits import WORD_BITS
+from jaxbox.xla.indexing import Operation, scatter
 from jaxbox.xla.loops import fold_rows
 
 Columns = Sequence[jax.Array]
 """What is reduced of a row: numbers () each, or (N,) of all rows."""
+
+HALF_BITS = 16
+MAX_HALF = 2 ** (HALF_BITS - 1) - 1
+"""Bits of half a word, and the greatest count that either half holds: the sign takes one."""
 
 _NEUTRAL = {"add": 0, "max": -jnp.inf, "min": jnp.inf}
 _JOIN = {"add": jnp.add, "max": jnp.maximum, "min": jnp.minimum}
@@ -28,22 +35,22 @@ def reduce_segments(
     num_rows: jax.Array,
     num_segments: int,
 ) -> jax.Array:
-    """Maxima and sums over the rows of each segment. Law: `jax.ops.segment_max` and `segment_sum`.
+    """Maxima and counts over the rows of each segment. Law: `jax.ops.segment_max`, and `segment_sum`.
 
     Args:
-      describe: gives the numbers of rows whose maxima are sought, and those whose sums are.
+      describe: gives the numbers of rows whose maxima are sought, and the flags that are counted, 0 or 1.
       rows: pytree of (N, ...) arrays.
       segment: (maps, N) int32, of each row on each map, in [0, S).
       num_rows: () int32; how many rows count, from the first on.
       num_segments: static, S.
 
     Returns:
-      (S, maxima + sums) float32: minus infinity and 0 where a segment has no row. Sums are whole numbers,
-      which float32 counts exactly up to 2^24.
+      (S, maxima + flags) float32: minus infinity and 0 where a segment has no row; float32 counts exactly up
+      to 2^24.
     """
     num_rows = jnp.minimum(num_rows, segment.shape[1])
-    maxima, sums = jax.eval_shape(describe, rows)
-    is_maximum = np.arange(len(maxima) + len(sums)) < len(maxima)
+    maxima, flags = jax.eval_shape(describe, rows)
+    is_maximum = np.arange(len(maxima) + len(flags)) < len(maxima)
     none = jnp.where(is_maximum, jnp.float32(-jnp.inf), 0)
     none = jnp.broadcast_to(none, (num_segments, is_maximum.size))
     reduce = _reduce_parallel if on_accelerator() else _reduce_sequential
@@ -86,13 +93,29 @@ def _reduce_parallel(
 ) -> jax.Array:
     valid = jnp.arange(segment.shape[1], dtype=jnp.int32) < num_rows
     row = jnp.where(valid, segment, table.shape[0])
-    own = jnp.broadcast_to(_as_row(describe(rows)), (*row.shape, table.shape[1]))
-    num_maxima = int(is_maximum.sum())
-    maxima = _scatter_privatized("max", row, own[..., :num_maxima], num_segments=table.shape[0])
-    # Whole numbers: ordered scatters of floats cost accelerators more.
-    whole = own[..., num_maxima:].astype(jnp.int32)
-    sums = _scatter_privatized("add", row, whole, num_segments=table.shape[0])
-    return jnp.concatenate([maxima, sums.astype(jnp.float32)], axis=1)
+    maxima, flags = describe(rows)
+    own = jnp.broadcast_to(_as_row((maxima, [])), (*row.shape, len(maxima)))
+    greatest = _scatter_privatized("max", row, own, num_segments=table.shape[0])
+    counts = _count_privatized(row, flags, num_segments=table.shape[0])
+    return jnp.concatenate([greatest, counts.astype(jnp.float32)], axis=1)
+
+
+def _count_privatized(segment: jax.Array, flags: Columns, *, num_segments: int) -> jax.Array:
+    """(S, flags) int32: how many rows of each segment have each flag.
+
+    Whole numbers: ordered scatters of floats cost accelerators more. Two counts share a word where none of a
+    private table can be too large for half of it.
+    """
+    num_tables = _num_tables(num_segments, len(flags))
+    most = math.prod(segment.shape[:-1]) * -(-segment.shape[-1] // num_tables)
+    if len(flags) != 2 or most > MAX_HALF:
+        own = jnp.broadcast_to(_as_row((flags, [])), (*segment.shape, len(flags))).astype(jnp.int32)
+        return _scatter_privatized("add", segment, own, num_segments=num_segments)
+    low, high = (flag.astype(jnp.int32) for flag in flags)
+    words = jnp.broadcast_to(low | high << HALF_BITS, segment.shape)[..., None]
+    words = _fill_tables("add", segment, words, num_segments, num_tables)[..., 0]
+    counts = words & 2**HALF_BITS - 1, words >> HALF_BITS
+    return jnp.stack(store([jnp.sum(each, axis=0, dtype=jnp.int32) for each in counts]), axis=1)
 
 
 def _scatter_privatized(
@@ -118,21 +141,32 @@ def _scatter_privatized(
     Returns:
       (S, C): 0, or infinite, where a segment has no row.
     """
-    columns = values.shape[-1]
     if num_tables is None:
-        num_tables = max(min(chunks.MAX_TABLES, chunks.TABLE_NUMBERS // max(num_segments * columns, 1)), 1)
+        num_tables = _num_tables(num_segments, values.shape[-1])
+    tables = _fill_tables(operation, segment, values, num_segments, num_tables)
+    if not on_accelerator():
+        # Table by table: a reduction along the first axis goes to YNNPACK, which takes ten times as long.
+        return functools.reduce(_JOIN[operation], tables)
+    if operation == "add":
+        return store(jnp.sum(tables, axis=0, dtype=values.dtype))
+    return store((jnp.max if operation == "max" else jnp.min)(tables, axis=0))
+
+
+def _num_tables(num_segments: int, columns: int) -> int:
+    """As many private tables as cost an accelerator little."""
+    return max(min(chunks.MAX_TABLES, chunks.TABLE_NUMBERS // max(num_segments * columns, 1)), 1)
+
+
+def _fill_tables(
+    operation: Operation, segment: jax.Array, values: jax.Array, num_segments: int, num_tables: int
+) -> jax.Array:
+    """(tables, S, C), see `_scatter_privatized`: the rows go to one after the other."""
+    columns = values.shape[-1]
     table = jax.lax.broadcasted_iota(jnp.int32, segment.shape, segment.ndim - 1) % num_tables
     # What lies past the last segment would be another table's.
     place = jnp.where(segment < num_segments, table * num_segments + segment, num_tables * num_segments)
     tables = jnp.full((num_tables * num_segments, columns), _NEUTRAL[operation], values.dtype)
-    filled = getattr(tables.at[place], operation)(values, mode="drop")
-    filled = filled.reshape(num_tables, num_segments, columns)
-    if not on_accelerator():
-        # Table by table: a reduction along the first axis goes to YNNPACK, which takes ten times as long.
-        return functools.reduce(_JOIN[operation], filled)
-    if operation == "add":
-        return jnp.sum(filled, axis=0, dtype=values.dtype)
-    return (jnp.max if operation == "max" else jnp.min)(filled, axis=0)
+    return scatter(operation, tables, place, values).reshape(num_tables, num_segments, columns)
 
 
 def _as_row(columns: tuple[Columns, Columns]) -> jax.Array:
@@ -176,7 +210,7 @@ def fold_segments(
         values = describe(*rows)
         if on_accelerator():  # Of all rows: there is nothing in the table yet.
             return _scatter_privatized(operation, rows[0], values, num_segments=num_segments)
-        return getattr(table.at[rows[0]], operation)(values, mode="drop")
+        return scatter(operation, table, rows[0], values)
 
     return fold_rows(fold, none, (segment, row), num_rows=num_rows, absent=(num_segments, absent))
 

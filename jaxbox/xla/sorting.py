@@ -11,8 +11,9 @@ from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
 from jaxbox.xla.barriers import materialize, single_kernel
 from jaxbox.xla.bits import WORD_BITS
+from jaxbox.xla.indexing import lookup, scatter
 from jaxbox.xla.loops import for_chunks
-from jaxbox.xla.rows import compact, lookup, prefix_sum
+from jaxbox.xla.rows import compact, prefix_sum
 
 
 def largest_first(size: jax.Array, max_size: int) -> tuple[jax.Array, jax.Array]:
@@ -60,7 +61,7 @@ def sort_by_group(
     size = group.shape[0]
     num_rows = jnp.minimum(num_rows, size)
     group = materialize(jnp.where(jnp.arange(size, dtype=jnp.int32) < num_rows, group, num_groups))
-    count = jnp.zeros(num_groups, jnp.int32).at[group].add(1, mode="drop")
+    count = scatter("add", jnp.zeros(num_groups, jnp.int32), group, 1)
     end = prefix_sum(count)
 
     if on_accelerator():
@@ -148,7 +149,7 @@ def compact_groups(keep: jax.Array, first: jax.Array, capacities: Sequence[int])
         place = order - before
         row = jnp.where(keep & (place > 0) & (place <= num), place - 1 + up_to - num, row)
     size, itself = keep.shape[0], jnp.arange(keep.shape[0], dtype=jnp.int32)
-    member = jnp.full(sum(capacities), size, jnp.int32).at[row].set(itself, mode="drop")
+    member = scatter("set", jnp.full(sum(capacities), size, jnp.int32), row, itself)
     return GroupedRows(row, member, found, jnp.stack(kept), kept_up_to[-1])
 
 
@@ -218,4 +219,4 @@ def best_first(score: jax.Array, num: jax.Array) -> jax.Array:
         place = _num_better(score)
     else:
         place = for_chunks(num, chunks.RANKS, step, jnp.zeros_like(row), capacity=size)
-    return jnp.full(size, size, jnp.int32).at[jnp.where(score > 0, place, size)].set(row, mode="drop")
+    return scatter("set", jnp.full(size, size, jnp.int32), jnp.where(score > 0, place, size), row)

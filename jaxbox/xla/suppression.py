@@ -29,42 +29,36 @@ def suppress_conflicts(rows: jax.Array, valid: jax.Array, conflict: Relation) ->
     Returns:
       (P,) bool.
     """
-    if on_accelerator():
-        return _suppress_parallel(rows, valid, conflict)
-    rivals = _rivals(rows, count_true(valid), conflict)[: valid.shape[0]]
+    rivals = _rivals(rows, valid, conflict)
 
     def without_rivals(keep: jax.Array) -> jax.Array:
         return valid & ~jnp.any((rivals & keep[None]) != 0, axis=1)
 
     def step(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        _, keep = state
-        return keep, pack_bits(without_rivals(keep))
-
-    every = pack_bits(valid)
-    init = jnp.zeros_like(every), every
-    return without_rivals(jax.lax.while_loop(lambda s: jnp.any(s[0] != s[1]), step, init)[1])
-
-
-def _suppress_parallel(rows: jax.Array, valid: jax.Array, conflict: Relation) -> jax.Array:
-    """As `suppress_conflicts`, all pairs in parallel, several rounds before each check for convergence."""
-    row = jnp.arange(valid.shape[0], dtype=jnp.int32)
-    rivals = all_pairs(conflict, rows, rows) & (row[None] < row[:, None])
-
-    def step(keep: jax.Array) -> jax.Array:
-        return valid & ~jnp.any(rivals & keep[None], axis=1)
+        return state[1], pack_bits(without_rivals(state[1]))
 
     def rounds(state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        before_last = functools.reduce(lambda keep, _: step(keep), range(ROUNDS - 1), state[1])
-        return before_last, step(before_last)
+        return functools.reduce(lambda state, _: step(state), range(ROUNDS), state)
 
-    return jax.lax.while_loop(lambda s: jnp.any(s[0] != s[1]), rounds, rounds((valid, valid)))[1]
+    every = pack_bits(valid)
+    turn, state = step, (jnp.zeros_like(every), every)
+    if on_accelerator():
+        # The first rounds without a look: for that the host would wait.
+        turn, state = rounds, rounds(state)
+    keep = jax.lax.while_loop(lambda state: jnp.any(state[0] != state[1]), turn, state)[1]
+    return without_rivals(keep)
 
 
-def _rivals(rows: jax.Array, num_rows: jax.Array, conflict: Relation) -> jax.Array:
-    """(P, P / 32) uint32: which earlier rows each one is in conflict with, as bits.
+def _rivals(rows: jax.Array, valid: jax.Array, conflict: Relation) -> jax.Array:
+    """(P, P / 32) uint32: which earlier rows each one is in conflict with, as bits."""
+    if on_accelerator():
+        row = jnp.arange(valid.shape[0], dtype=jnp.int32)
+        return pack_bits(all_pairs(conflict, rows, rows) & (row[None] < row[:, None]))
+    return _rivals_by_words(rows, count_true(valid), conflict)[: valid.shape[0]]
 
-    One word of each of 32 rows at a time, and only words of rows that come earlier.
-    """
+
+def _rivals_by_words(rows: jax.Array, num_rows: jax.Array, conflict: Relation) -> jax.Array:
+    """As `_rivals`, one word of each of 32 rows at a time, and only words of rows that come earlier."""
     rows = whole_chunks(rows, WORD_BITS)
     row = jnp.arange(WORD_BITS, dtype=jnp.uint32)
 
