@@ -93,6 +93,7 @@ ABLATIONS = (
     Ablation("far ends as fitted, not where the last point is", {
         "completion.end_points": NO_LIMIT, "vehicles.hidden_length_score": 1.0,
     }),
+    Ablation("boxes turned against the best not blended into it", {"completion.blend_objective": 0.0}),
     Ablation("rows of vehicles side by side as others", {
         "completion.row_distance_m": 0.0, "completion.row_shift_m": 0.0,
     }),

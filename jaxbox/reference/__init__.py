@@ -24,6 +24,7 @@ from jaxbox.reference.clustering import (
 )
 from jaxbox.reference.completion import (
     assign_length_axis,
+    blend_boxes,
     choose_placement,
     complete_box,
     complete_boxes,
@@ -206,6 +207,7 @@ __all__ = [
     "azimuth_cell",
     "best_rectangles",
     "bev_iou",
+    "blend_boxes",
     "build_evidence",
     "cast_rays",
     "cell_minima",

@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 from collections.abc import Collection, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,11 @@ AWAY, TOWARDS, BOTH = 0, 1, 2
 """Placements: which way a completed side extends, as seen from the sensor."""
 SEEN_RAMP = 0.05
 """Share of the usual size over which a side goes from partly hidden to seen whole."""
+BLEND_FROM_DEG, BLEND_ALL_DEG, BLEND_TO_DEG = 8, 12, 30.5
+"""Boxes turned against each other by more than the first are blended, by the second and more in full, up to
+the third."""
+MIN_LOSS = 1e-6
+"""Objectives nearer than this are equal."""
 LOWER_PART_M = 0.5
 """A cluster may be so much lower than its vehicle."""
 
@@ -177,9 +183,9 @@ def complete_box(
 
     "evidence" tries each side of each rectangle as the length, extended away from the sensor, with the
     width extended away from it, towards it, or both ways, and takes the largest objective (see
-    `choose_placement`). Boxes are judged at the class's size, and answered at their likely size (see
-    `likely_sizes`). "away" takes the longer side of the first rectangle as the length and extends both
-    away; "none" changes nothing.
+    `choose_placement`), blended with others (see `blend_boxes`). Boxes are judged at the class's size, and
+    answered at their likely size (see `likely_sizes`). "away" takes the longer side of the first rectangle as
+    the length and extends both away; "none" changes nothing.
 
     Args:
       xy: (n, 2) m, sensor frame: the fitted points.
@@ -196,23 +202,54 @@ def complete_box(
         sides = longer_side(rectangles[0])
         return keep_measured(sides, prior) if config.mode == "none" else extend_away(sides, prior, config)
     assert evidence is not None
-    best: CompletedBox | None = None
+    boxes: list[CompletedBox] = []
     for i, rectangle in enumerate(rectangles):
+        is_new = all(rectangle.angle != before.angle for before in rectangles[:i])
         for side in (0, 1):
             sides = assign_length_axis(rectangle, side)
-            if not fits(sides, prior):
+            if not is_new or not fits(sides, prior):
                 continue
             between = (i, side) in in_row
-            boxes = place_widths(sides, prior)
-            rays = cast_rays(evidence, boxes, num_rays=config.num_rays)
+            placed = place_widths(sides, prior)
+            rays = cast_rays(evidence, placed, num_rays=config.num_rays)
             free_length, hit = closed_free_length(rays, prior), hit_share(rays, between)
             rays = dataclasses.replace(rays, hit=hit, free_length=free_length)
-            agreement = point_agreement(boxes, xy, config)
+            agreement = point_agreement(placed, xy, config)
             placement, objective = choose_placement(rectangle.score, agreement, rays, config)
-            if best is None or objective > best.objective:
-                box = place(sides, likely_sizes(sides, prior, config), placement, objective)
-                best = dataclasses.replace(box, in_row=between)
-    return best
+            box = place(sides, likely_sizes(sides, prior, config), placement, objective)
+            boxes.append(dataclasses.replace(box, in_row=between))
+    return blend_boxes(boxes, max_loss=config.blend_objective) if boxes else None
+
+
+def blend_boxes(boxes: Sequence[CompletedBox], *, max_loss: Scalar) -> CompletedBox:
+    """The best of a cluster's boxes, blended with those turned from it that are nearly as good.
+
+    Args:
+      boxes: at least one, with finite objectives.
+      max_loss: by how much less an objective may be; the weight falls to 0 there.
+
+    Returns:
+      The box, with the objective, and all else, of the first of the best.
+    """
+    best = max(boxes, key=lambda box: box.objective)
+    weights, turns = [], []
+    for box in boxes:
+        turn = (box.box[4] - best.box[4] + np.pi / 2) % np.pi - np.pi / 2
+        degrees = abs(np.degrees(turn))
+        near = np.clip(1 - (best.objective - box.objective) / max(float(max_loss), MIN_LOSS), 0, 1)
+        apart = np.clip((degrees - BLEND_FROM_DEG) / (BLEND_ALL_DEG - BLEND_FROM_DEG), 0, 1)
+        weights.append(1.0 if box is best else near * apart * (degrees < BLEND_TO_DEG))
+        turns.append(turn)
+
+    def mean(values: Sequence[Any]) -> Any:
+        return np.average(np.array(values), axis=0, weights=weights)
+
+    return dataclasses.replace(
+        best,
+        box=np.append(mean([box.box[:4] for box in boxes]), best.box[4] + mean(turns)),
+        measured_length_m=float(mean([box.measured_length_m for box in boxes])),
+        measured_width_m=float(mean([box.measured_width_m for box in boxes])),
+    )
 
 
 def assign_length_axis(rectangle: Rectangle, side: int) -> Assignment:

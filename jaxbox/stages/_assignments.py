@@ -21,6 +21,15 @@ SEEN_RAMP = 0.05
 """Fraction of the usual size over which a side goes from partly hidden to seen whole."""
 
 
+MIN_LOSS = 1e-6
+"""Objectives nearer than this are equal."""
+
+
+BLEND_FROM_DEG, BLEND_ALL_DEG, BLEND_TO_DEG = 8, 12, 30.5
+"""Boxes turned against each other by more than the first are blended, by the second and more in full: less
+makes little difference. Beyond the last they are of different things. (Rotations are a degree apart.)"""
+
+
 CERTAIN = 1e3
 """Objective of a box that no evidence weighs: it passes any gate on the objective."""
 
@@ -196,4 +205,49 @@ def place(
         measured=jnp.stack(sides.measured, axis=-1),
         objective=objective,
         in_row=jnp.zeros_like(objective, bool),
+    )
+
+
+def blend_boxes(boxes: Boxes, *, max_loss: jax.Array | float) -> Boxes:
+    """The best of several boxes of each thing, blended with those turned from it that are nearly as good.
+
+    A thing seen in part may fit two rotations nearly as well. A little noise decides which is better, and the
+    box would jump by what they differ.
+
+    Args:
+      boxes: (C, W).
+      max_loss: by how much less an objective may be; the weight falls to 0 there.
+
+    Returns:
+      The boxes (C,), with the objective, and all else, of the best.
+
+    Reference: oracle `jaxbox.reference.blend_boxes`.
+    """
+    best = jax.lax.argmax(boxes.objective, 1, jnp.int32)[:, None]
+
+    def of_best(values: jax.Array) -> jax.Array:
+        index = best.reshape(-1, *[1] * (values.ndim - 1))
+        return jnp.take_along_axis(values, index, axis=1)[:, 0]
+
+    chosen = jax.tree.map(of_best, boxes)
+    turn = boxes.yaw - chosen.yaw[:, None]
+    turn = turn - math.pi * jnp.round(turn / math.pi)
+    degrees = jnp.abs(turn) * (180 / math.pi)
+    loss = chosen.objective[:, None] - boxes.objective
+    weight = jnp.clip(1 - loss / jnp.maximum(max_loss, MIN_LOSS), 0, 1)
+    weight = weight * jnp.clip((degrees - BLEND_FROM_DEG) / (BLEND_ALL_DEG - BLEND_FROM_DEG), 0, 1)
+    weight = jnp.where(degrees < BLEND_TO_DEG, weight, 0)
+    weight = jnp.where(jnp.arange(weight.shape[1], dtype=jnp.int32)[None] == best, 1, weight)
+    share = weight / jnp.sum(weight, axis=1, keepdims=True)
+
+    def mean(values: jax.Array) -> jax.Array:
+        return jnp.sum(share.reshape(*share.shape, *[1] * (values.ndim - 2)) * values, axis=1)
+
+    return dataclasses.replace(
+        chosen,
+        center=mean(boxes.center),
+        length=mean(boxes.length),
+        width=mean(boxes.width),
+        measured=mean(boxes.measured),
+        yaw=chosen.yaw + mean(turn),
     )

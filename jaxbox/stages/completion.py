@@ -15,6 +15,7 @@ from jaxbox.stages._assignments import (
     NUM_PLACEMENTS,
     Assignments,
     assign_length_axis,
+    blend_boxes,
     extend,
     extend_away,
     fits,
@@ -174,11 +175,15 @@ def _complete_by_evidence(
 
     def complete(of_hypothesis: tuple[jax.Array, ...]) -> Boxes:
         cluster, label, *judged = of_hypothesis
-        best = jax.lax.argmax(judged[1], 1, jnp.int32)
-        placement, objective, in_row = (jnp.take_along_axis(a, best[:, None], axis=1)[:, 0] for a in judged)
-        sides = _assign(candidates, best, cluster)
+        shape = judged[0].shape
+        placement, objective, in_row = (a.reshape(-1) for a in judged)
+        number = jnp.tile(jnp.arange(shape[1], dtype=jnp.int32), shape[0])
+        cluster, label = jnp.repeat(cluster, shape[1]), jnp.repeat(label, shape[1])
+        sides = _assign(candidates, number, cluster)
         sizes = likely_sizes(sides, prior_of(config.vehicles.classes, label), config.completion)
-        return dataclasses.replace(place(sides, sizes, placement, objective), in_row=in_row)
+        boxes = dataclasses.replace(place(sides, sizes, placement, objective), in_row=in_row)
+        boxes = jax.tree.map(lambda a: a.reshape(*shape, *a.shape[1:]), boxes)
+        return blend_boxes(boxes, max_loss=config.completion.blend_objective)
 
     rows = hypotheses.cluster, hypotheses.label, *judged
     return map_rows(complete, rows, num_rows=hypotheses.num, chunk=chunks.PROPOSALS), num
