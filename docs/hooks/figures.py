@@ -99,6 +99,20 @@ def _preset_figures(accuracy_of_20: str, ending: str) -> dict[str, float]:
     }
 
 
+def ablation() -> str:
+    """What is gained or lost without each part, in the mean of copies."""
+    report = load("ablation")
+    columns = ["SOFT of 20", "SOFT of 58", "3d moderate", "vehicles bev", "false a frame"]
+    full, *others = report["rows"].items()
+
+    def mean(row: dict[str, Any], name: str) -> float:
+        return sum(copy[name] for copy in row["copies"].values()) / len(row["copies"])
+
+    rows = [(name, *(mean(row, column) - mean(full[1], column) for column in columns)) for name, row in others]
+    whole = (full[0], *(mean(full[1], column) for column in columns))
+    return table(["", *columns], [whole, *rows]) + made_with(report)
+
+
 def ap(values: dict[str, float], names: Sequence[str]) -> list[float]:
     """In the order of the header."""
     return [values[name] for name in names]
@@ -712,6 +726,7 @@ def takes(name: str, field: dataclasses.Field[Any]) -> str:
 
 TABLES: dict[str, Callable[[], str]] = {
     "accuracy": accuracy,
+    "ablation": ablation,
     "readings": readings,
     "sizes": sizes,
     "paper": paper_table,
