@@ -108,7 +108,9 @@ def ablation() -> str:
     def mean(row: dict[str, Any], name: str) -> float:
         return sum(copy[name] for copy in row["copies"].values()) / len(row["copies"])
 
-    rows = [(name, *(mean(row, column) - mean(full[1], column) for column in columns)) for name, row in others]
+    rows = [
+        (name, *(mean(row, column) - mean(full[1], column) for column in columns)) for name, row in others
+    ]
     whole = (full[0], *(mean(full[1], column) for column in columns))
     return table(["", *columns], [whole, *rows]) + made_with(report)
 
