@@ -30,6 +30,21 @@ def test_gathered_rows_are_those_at_the_indices_in_a_batch_too(shape, num_batche
 
 
 @pytest.mark.usefixtures("platform")
+def test_a_batch_of_more_rows_than_an_index_counts_is_the_same(monkeypatch):
+    rng = np.random.default_rng(0)
+    table, index = rng.normal(size=(4, 9)).astype(np.float32), rng.integers(0, 12, (4, 5), np.int32)
+
+    def both(table, index):
+        found = indexing.gather(table, jnp.minimum(index, 8))
+        return found, indexing.scatter("max", table, index, 2 * found)
+
+    few = jax.jit(jax.vmap(functools.partial(both)))(table, index)
+    monkeypatch.setattr(indexing, "MAX_ROWS", 4 * 9 - 1)
+    many = jax.jit(jax.vmap(functools.partial(both)))(table, index)
+    jax.tree.map(np.testing.assert_array_equal, few, many)
+
+
+@pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize(("of_rows", "of_index"), [(0, None), (None, 0)])
 def test_a_batch_shares_the_rows_or_the_indices(of_rows, of_index):
     rng = np.random.default_rng(0)

@@ -18,6 +18,9 @@ from jaxbox.xla.barriers import materialize
 Operation = Literal["add", "max", "min", "set"]
 """What an update does with the number that is there."""
 
+MAX_ROWS = 2**31 - 1
+"""More rows than these have no index of 32 bits: larger batches keep two indices."""
+
 FEW_COLUMNS = 8
 """Tables with no more columns are looked up column by column on an accelerator."""
 
@@ -184,6 +187,8 @@ def _gather_batch(
         return _gather(rows, index), True
     index = index if is_batched[1] else jnp.broadcast_to(index, (size, *index.shape))
     num = rows.shape[1]
+    if size * num > MAX_ROWS:
+        return jax.vmap(_take)(rows, index), True
     return _gather(_joined(rows), _first_rows(size, num, index.ndim) + jnp.clip(index, 0, num - 1)), True
 
 
@@ -198,6 +203,8 @@ def _scatter(operation: Operation) -> Callable[[jax.Array, jax.Array, jax.Array]
             for a, batched in zip(operands, is_batched, strict=True)
         )
         num = rows.shape[1]
+        if size * num > MAX_ROWS:
+            return jax.vmap(functools.partial(_update, operation))(rows, index, values), True
         index = jnp.where(index < num, _first_rows(size, num, index.ndim) + index, size * num)
         return update(_joined(rows), index, values).reshape(rows.shape), True
 
