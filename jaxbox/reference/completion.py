@@ -204,10 +204,11 @@ def complete_box(
     assert evidence is not None
     boxes: list[CompletedBox] = []
     for i, rectangle in enumerate(rectangles):
-        is_new = all(rectangle.angle != before.angle for before in rectangles[:i])
+        if any(rectangle.angle == before.angle for before in rectangles[:i]):
+            continue
         for side in (0, 1):
             sides = assign_length_axis(rectangle, side)
-            if not is_new or not fits(sides, prior):
+            if not fits(sides, prior):
                 continue
             between = (i, side) in in_row
             placed = place_widths(sides, prior)

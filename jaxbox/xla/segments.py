@@ -49,12 +49,8 @@ def reduce_segments(
       to 2^24.
     """
     num_rows = jnp.minimum(num_rows, segment.shape[1])
-    maxima, flags = jax.eval_shape(describe, rows)
-    is_maximum = np.arange(len(maxima) + len(flags)) < len(maxima)
-    none = jnp.where(is_maximum, jnp.float32(-jnp.inf), 0)
-    none = jnp.broadcast_to(none, (num_segments, is_maximum.size))
     reduce = _reduce_parallel if on_accelerator() else _reduce_sequential
-    return reduce(describe, rows, segment, num_rows, none, is_maximum)
+    return reduce(describe, rows, segment, num_rows, num_segments)
 
 
 def _reduce_sequential(
@@ -62,10 +58,13 @@ def _reduce_sequential(
     rows: Any,
     segment: jax.Array,
     num_rows: jax.Array,
-    table: jax.Array,
-    is_maximum: np.ndarray,
+    num_segments: int,
 ) -> jax.Array:
     """Row after row: XLA compiles so small a loop to native code, which adds a whole row at a time."""
+    maxima, flags = jax.eval_shape(describe, rows)
+    is_maximum = np.arange(len(maxima) + len(flags)) < len(maxima)
+    none = jnp.where(is_maximum, jnp.float32(-jnp.inf), 0)
+    table = jnp.broadcast_to(none, (num_segments, is_maximum.size))
 
     def add(maps: range, i: jax.Array, table: jax.Array) -> jax.Array:
         own = _as_row(describe(jax.tree.map(lambda a: a[i], rows)))
@@ -88,15 +87,14 @@ def _reduce_parallel(
     rows: Any,
     segment: jax.Array,
     num_rows: jax.Array,
-    table: jax.Array,
-    is_maximum: np.ndarray,
+    num_segments: int,
 ) -> jax.Array:
     valid = jnp.arange(segment.shape[1], dtype=jnp.int32) < num_rows
-    row = jnp.where(valid, segment, table.shape[0])
+    row = jnp.where(valid, segment, num_segments)
     maxima, flags = describe(rows)
     own = jnp.broadcast_to(_as_row((maxima, [])), (*row.shape, len(maxima)))
-    greatest = _scatter_privatized("max", row, own, num_segments=table.shape[0])
-    counts = _count_privatized(row, flags, num_segments=table.shape[0])
+    greatest = _scatter_privatized("max", row, own, num_segments=num_segments)
+    counts = _count_privatized(row, flags, num_segments=num_segments)
     return jnp.concatenate([greatest, counts.astype(jnp.float32)], axis=1)
 
 
