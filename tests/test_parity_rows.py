@@ -30,6 +30,28 @@ def in_rows(ends):
     return expected.tolist()
 
 
+find_lines = parity.PerForm(lambda *rows: _rows.find_lines(*rows, parity.CONFIG.vehicles))
+
+
+def in_lines(boxes, early):
+    """Which of boxes (n, 5) are in a line, by the stage and, the same, by the reference."""
+    early = np.broadcast_to(np.float32(early), len(boxes))
+    padded = parity.pad(boxes, CAPACITY), parity.pad(early, CAPACITY, fill=1)
+    found = np.asarray(find_lines(*padded, np.arange(CAPACITY) < len(boxes)))
+    assert not found[len(boxes) :].any()
+    expected = reference.find_lines(boxes, early, parity.CONFIG.vehicles)
+    np.testing.assert_array_equal(found[: len(boxes)], expected)
+    return expected.tolist()
+
+
+def nose_to_tail(*ahead_m, yaw=0.7, asides_m=None):
+    """(n, 5) boxes of 4 m in a line, with these places of their middles along it and aside."""
+    asides = np.zeros(len(ahead_m)) if asides_m is None else np.array(asides_m)
+    places = np.outer(ahead_m, [np.cos(yaw), np.sin(yaw)]) + np.outer(asides, [-np.sin(yaw), np.cos(yaw)])
+    places += 20.0
+    return np.column_stack([places, np.tile([4.0, 1.6, yaw], (len(ahead_m), 1))])
+
+
 def side_by_side(*sides_m, yaw=0.7, shifts_m=None):
     """(n, 3) ends of vehicles in a row 20 m ahead, at these places along it, one farther than the other."""
     across, away = np.array([-np.sin(yaw), np.cos(yaw)]), np.array([np.cos(yaw), np.sin(yaw)])
@@ -67,6 +89,41 @@ def test_rows_of_random_ends_are_those_of_the_reference_in_any_order(seed):
     found, order = np.array(in_rows(ends)), rng.permutation(150)
     assert 0 < found.sum() < 150
     assert in_rows(ends[order]) == found[order].tolist()
+
+
+@pytest.mark.usefixtures("platform")
+def test_three_nose_to_tail_are_a_line_and_two_are_not():
+    assert in_lines(nose_to_tail(0, 4.2), 1) == [False, False]
+    assert in_lines(nose_to_tail(0, 4.2, 8.4), 1) == [True, True, True]
+    assert in_lines(nose_to_tail(8.4, 0, 4.2, 40.0), 1) == [True, True, True, False]
+    # Where one is missing there are two.
+    assert in_lines(nose_to_tail(0, 4.2, 12.6), 1) == [False, False, False]
+
+
+@pytest.mark.usefixtures("platform")
+def test_what_is_too_far_too_near_turned_aside_or_unsure_is_not_in_the_line():
+    most = 4 * parity.CONFIG.vehicles.line_lengths
+    assert in_lines(nose_to_tail(0, most + 0.1, 2 * most + 0.2), 1) == [False, False, False]
+    assert in_lines(nose_to_tail(0, 2, 4), 1) == [False, False, False]
+    assert in_lines(nose_to_tail(0, 4.2, 8.4, asides_m=[0, 0.4, 0]), 1) == [False, False, False]
+    assert in_lines(nose_to_tail(0, 4.2, 8.4), [1, 0.2, 1]) == [False, False, False]
+    turned = nose_to_tail(0, 4.2, 8.4)
+    turned[1, 4] += 0.2
+    assert in_lines(turned, 1) == [False, False, False]
+    turned[1, 4] += np.pi - 0.2
+    assert in_lines(turned, 1) == [True, True, True]
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("seed", range(5))
+def test_lines_of_random_boxes_are_those_of_the_reference_in_any_order(seed):
+    rng = np.random.default_rng(seed)
+    sizes = rng.uniform([3.5, 1.5], [4.5, 1.8], (150, 2))
+    boxes = np.column_stack([rng.uniform(-15, 15, (150, 2)), sizes, rng.choice([0, 0.1, 3.2], 150)])
+    boxes, early = boxes.astype(np.float32), rng.uniform(0, 1, 150).astype(np.float32)
+    found, order = np.array(in_lines(boxes, early)), rng.permutation(150)
+    assert 0 < found.sum() < 150
+    assert in_lines(boxes[order], early[order]) == found[order].tolist()
 
 
 def test_only_ends_as_wide_as_a_vehicle_beside_no_sensor_are_looked_at():

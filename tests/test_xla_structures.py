@@ -466,6 +466,19 @@ def test_words_of_a_row_join_what_it_is_to_each_row_that_counts(size):
         np.testing.assert_array_equal(join(jnp.int32(num)), expected)
 
 
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("share", [0, 0.1, 0.5, 1])
+def test_rows_that_a_mask_picks_are_joined_with_each_other_alone(share):
+    rng = np.random.default_rng(0)
+    rows, mask = rng.integers(0, 32, 200).astype(np.uint32), rng.uniform(size=200) < share
+    join = jax.jit(
+        lambda mask: pairs.join_some(jnp.asarray(rows), mask, lambda own, other: own ^ (1 << other))
+    )
+    each = np.uint32(rows[:, None] ^ (np.uint32(1) << rows[None, :]))
+    expected = np.where(mask, np.bitwise_or.reduce(each[:, mask], axis=1, initial=0), 0)
+    np.testing.assert_array_equal(join(mask), expected)
+
+
 def test_all_pairs_are_each_row_with_each_other_one():
     first, second = np.arange(6).reshape(3, 2), np.arange(10).reshape(5, 2)
     found = pairs.all_pairs(lambda a, b: a[0] - b[1], jnp.asarray(first), jnp.asarray(second))

@@ -312,9 +312,13 @@ class CompletionConfig:
     it by 8 to 30 degrees: a little noise would decide between them. 0 blends none."""
     row_distance_m: Scalar = 3.0
     """Of vehicles of the first class that stand side by side, three or more, each hides the sides of the
-    next: only the rays that reach them count. From one to the next it is at most this far,"""
+    next: only the rays that reach them count, and the surer a box is, the less what is round it. From one
+    to the next it is at most this far,"""
     row_shift_m: Scalar = 0.7
     """and one stands at most this much farther forward than the other."""
+    row_preference: Scalar = 0.2
+    """Added to the objective of a box in such a row: read along the row instead, it would reach over the ends
+    of its neighbours."""
 
 
 @config_class
@@ -344,6 +348,10 @@ class VehicleConfig:
     """A point farther outside than the margin but nearer than this speaks against the box, unless it is
     behind a face that the sensor does not see, and so of another thing; past the ends of long vehicles also
     one that is ``ClassPrior.past_ends_m`` farther."""
+    line_lengths: Scalar = 1.5
+    """Of vehicles of the first class nose to tail, three or more, what is round one is of its neighbours:
+    the surer a box is, the less it counts. From the middle of one to that of the next it is less
+    than this many lengths."""
     top_quantile: Scalar = 0.01
     """Share of the points in a box that may lie above its top: a single return in the air is not a roof."""
     top_margin_m: Scalar = 0.03

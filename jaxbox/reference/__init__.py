@@ -117,6 +117,7 @@ from jaxbox.reference.rectangles import (
     wrap_yaw,
 )
 from jaxbox.reference.rows import (
+    find_lines,
     find_rows,
     hit_share,
     visible_end,
@@ -238,6 +239,7 @@ __all__ = [
     "find_cells",
     "find_clusters",
     "find_fronts",
+    "find_lines",
     "find_rows",
     "first_returns",
     "fit_ground_plane",

@@ -1,9 +1,12 @@
-"""Vehicles that stand side by side in a row: each hides the sides of the next from the sensor."""
+"""Vehicles that stand in a row, side by side or nose to tail: what is round one is of its neighbours."""
+
+from collections.abc import Iterable
 
 import numpy as np
 
-from jaxbox.config import ClassPrior, CompletionConfig
+from jaxbox.config import ClassPrior, CompletionConfig, VehicleConfig
 from jaxbox.reference.state import Assignment, RayFractions
+from jaxbox.reference.surroundings import in_box_frame
 
 NARROWEST, WIDEST = 0.8, 1.15
 """Share of the class's width that the visible end of a vehicle has."""
@@ -11,6 +14,12 @@ NEAREST = 1.1
 """Two ends that are nearer than this share of the width are readings of one vehicle."""
 MAX_SINE = 0.2
 """Sine of the largest angle between vehicles side by side."""
+NEAREST_LENGTHS = 0.95
+"""Two boxes in a line whose middles are fewer lengths apart are readings of one vehicle."""
+MAX_ASIDE_M, MAX_LINE_SINE = 0.35, 0.12
+"""How far a vehicle in a line stands to the side of the next, and the sine of the angle between them."""
+MIN_EARLY = 0.3
+"""What scores less by rays and size makes no line."""
 MIN_REACHED = 0.05
 """Share of the rays that reaches a box, at the least."""
 
@@ -56,9 +65,42 @@ def find_rows(ends: np.ndarray, width_m: float, config: CompletionConfig) -> np.
         places = np.where(np.abs(left) <= apart_m, 1, 2)
         counts = parallel & (np.abs(left) <= 2 * apart_m) & (np.abs(left) > NEAREST * width_m)
         counts &= np.abs(along) <= places * shift_m
-        where = set((np.sign(left) * places)[counts])
-        found[row] = any(two <= where for two in ({-1, 1}, {1, 2}, {-1, -2}))
+        found[row] = _in_three((np.sign(left) * places)[counts])
     return found
+
+
+def find_lines(boxes: np.ndarray, early: np.ndarray, config: VehicleConfig) -> np.ndarray:
+    """Which boxes are in a line of three or more vehicles nose to tail.
+
+    Args:
+      boxes: (n, 5) x, y, length, width in m and yaw in rad.
+      early: (n,) scores by rays and size.
+      config: how many lengths apart neighbours stand.
+
+    Returns:
+      (n,) bool: between two neighbours, or before one that has another one before it.
+    """
+    found = np.zeros(len(boxes), bool)
+    may_be = np.flatnonzero(early > MIN_EARLY)
+    others = boxes[may_be]
+    for row in may_be:
+        ahead, aside = in_box_frame(others[:, :2], boxes[row]).T
+        lengths = ahead / ((others[:, 2] + boxes[row, 2]) / 2)
+        turned = np.sin(others[:, 4] - boxes[row, 4])
+        aligned = (np.abs(aside) < MAX_ASIDE_M) & (np.abs(turned) < MAX_LINE_SINE)
+        first, second = (
+            aligned & (np.abs(lengths) > n * NEAREST_LENGTHS) & (np.abs(lengths) < n * config.line_lengths)
+            for n in (1, 2)
+        )
+        places = np.sign(lengths) * np.where(first, 1, 2)
+        found[row] = _in_three(places[first | second])
+    return found
+
+
+def _in_three(places: Iterable[float]) -> bool:
+    """Whether neighbours at places 1 and 2 on one side, -1 and -2 on the other, make a third of three."""
+    where = set(places)
+    return any(two <= where for two in ({-1, 1}, {1, 2}, {-1, -2}))
 
 
 def hit_share(rays: RayFractions, in_row: bool | np.ndarray) -> np.ndarray:

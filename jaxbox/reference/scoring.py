@@ -10,7 +10,7 @@ from scipy.special import expit
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, Scalar, VehicleConfig
 from jaxbox.reference.completion import share_seen
 from jaxbox.reference.evidence import GroundElevation, closed_free_length
-from jaxbox.reference.rows import hit_share
+from jaxbox.reference.rows import find_lines, hit_share
 from jaxbox.reference.state import (
     Candidate,
     ClassHypothesis,
@@ -61,40 +61,61 @@ def score_boxes(
     Returns:
       What scores more than the least score, best first.
     """
-
     in_row = np.array([box.in_row for box in completed.boxes], bool)
+    early = _early_scores(completed, rays, clusters, in_row, config.vehicles)
+    in_line = _in_lines(completed, early, config.vehicles)
+    is_open = np.ones(len(early)) if rays is None else rays[0].open
 
     def judge(row: int, hypothesis: ClassHypothesis, box: CompletedBox) -> Candidate:
         cluster, prior = clusters[hypothesis.cluster], config.vehicles.classes[hypothesis.label]
-        hit, free_length, is_open, support = 1.0, 0.0, 1.0, None
-        if rays is not None:
-            free = closed_free_length(rays[0], prior)
-            seen = hit_share(rays[0], in_row), free, rays[0].open, rays[1]
-            hit, free_length, is_open, support = (float(a[row]) for a in seen)
-        early = early_score(
-            box,
-            prior,
-            num_points=len(cluster.members),
-            hit=hit,
-            free_length=free_length,
-            support=support,
-            config=config.vehicles,
-        )
-        around = _look_around(box.box, prior, cluster, early, obstacles, config.vehicles)
+        score = float(early[row])
+        in_threes = bool(in_row[row] or in_line[row])
+        around = _look_around(box.box, prior, cluster, score, in_threes, obstacles, config.vehicles)
         if config.vehicles.neighbourhood and config.completion.mode != "none":
             ended, seen = _end_where_seen(box, around, float(prior.length_m), config)
             box = box if box.in_row else dataclasses.replace(box, box=ended)
-            early *= seen + float(config.vehicles.hidden_length_score) * (1 - seen)
+            score *= seen + float(config.vehicles.hidden_length_score) * (1 - seen)
         rho = float(np.hypot(box.box[0], box.box[1]))
         lowest_z = obstacles.xyz[cluster.members, 2].min() if config.ground.max_planes > 1 else 0.0
-        where = rho, reach(box.box, lowest_z), box.measured_width_m, is_open
+        where = rho, reach(box.box, lowest_z), box.measured_width_m, float(is_open[row])
         late, top_unseen = neighbourhood_score(around, *where, prior, config.vehicles)
-        return Candidate(hypothesis, box, around, top_unseen, early * late)
+        return Candidate(hypothesis, box, around, top_unseen, score * late)
 
     pairs = zip(completed.hypotheses, completed.boxes, strict=True)
     candidates = [judge(row, *pair) for row, pair in enumerate(pairs)]
     candidates = [candidate for candidate in candidates if candidate.score > config.vehicles.min_score]
     return sorted(candidates, key=lambda candidate: -candidate.score)
+
+
+def _early_scores(
+    completed: Completed,
+    rays: tuple[RayFractions, np.ndarray] | None,
+    clusters: Sequence[Cluster],
+    in_row: np.ndarray,
+    config: VehicleConfig,
+) -> np.ndarray:
+    """(q,) the part of the scores that needs no look at the surroundings."""
+    early = []
+    hits = None if rays is None else hit_share(rays[0], in_row)
+    for row, (hypothesis, box) in enumerate(zip(completed.hypotheses, completed.boxes, strict=True)):
+        prior = config.classes[hypothesis.label]
+        hit, free_length, support = 1.0, 0.0, None
+        if rays is not None and hits is not None:
+            seen = hits, closed_free_length(rays[0], prior), rays[1]
+            hit, free_length, support = (float(a[row]) for a in seen)
+        num_points = len(clusters[hypothesis.cluster].members)
+        rates = {"hit": hit, "free_length": free_length, "support": support}
+        early.append(early_score(box, prior, num_points=num_points, **rates, config=config))
+    return np.array(early)
+
+
+def _in_lines(completed: Completed, early: np.ndarray, config: VehicleConfig) -> np.ndarray:
+    """(q,) bool: boxes of the first class in lines of vehicles nose to tail."""
+    found = np.zeros(len(early), bool)
+    rows = [row for row, hypothesis in enumerate(completed.hypotheses) if hypothesis.label == 0]
+    boxes = np.array([completed.boxes[row].box for row in rows]).reshape(-1, 5)
+    found[rows] = find_lines(boxes, early[rows], config)
+    return found
 
 
 def reach_of_beams(
@@ -122,13 +143,15 @@ def _look_around(
     prior: ClassPrior,
     cluster: Cluster,
     early: float,
+    in_threes: bool,
     obstacles: Obstacles,
     config: VehicleConfig,
 ) -> NeighbourhoodCounts:
     if not config.neighbourhood:
         return cluster_alone(len(cluster.members), cluster.top_m)
     sure = early * min(len(cluster.members) / float(config.saturation_points), 1.0) ** 2
-    return count_points_around(box, prior, obstacles, config, sure=sure)
+    around = count_points_around(box, prior, obstacles, config, sure=sure)
+    return dataclasses.replace(around, num_ring=(1 - sure) * around.num_ring) if in_threes else around
 
 
 def _end_where_seen(

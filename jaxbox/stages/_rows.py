@@ -1,14 +1,15 @@
-"""Vehicles that stand side by side in a row: each hides the sides of the next from the sensor."""
+"""Vehicles that stand in a row, side by side or nose to tail: what is round one is of its neighbours."""
+
+import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 
-from jaxbox.config import ClassPrior, CompletionConfig
+from jaxbox.config import ClassPrior, CompletionConfig, VehicleConfig
 from jaxbox.stages._assignments import Assignments
 from jaxbox.stages.state import RayFractions
-from jaxbox.xla.indexing import take
-from jaxbox.xla.pairs import join_pairs
-from jaxbox.xla.rows import compact
+from jaxbox.xla.pairs import join_some
 
 NARROWEST, WIDEST = 0.8, 1.15
 """The visible end of a vehicle is so wide, as a fraction of the class's width."""
@@ -22,12 +23,24 @@ MAX_SINE = 0.2
 """Sine of the angle between vehicles that stand side by side."""
 
 
+NEAREST_LENGTHS = 0.95
+"""The middles of two vehicles nose to tail are at least so far apart, as a fraction of their length."""
+
+
+MAX_ASIDE_M, MAX_LINE_SINE = 0.35, 0.12
+"""How far one stands to the side of the other, and the sine of the angle between them."""
+
+
+MIN_EARLY = 0.3
+"""What scores less by rays and size makes no line."""
+
+
 MIN_REACHED = 0.05
 """At least this fraction of the rays reaches a box: a few rays must not give an extreme fraction."""
 
 
-LEFT, SECOND_LEFT, RIGHT, SECOND_RIGHT = 1, 2, 4, 8
-"""Where a neighbour stands, as a flag."""
+ONE_SIDE, SECOND, OTHER_SIDE, OTHER_SECOND = 1, 2, 4, 8
+"""Where a neighbour stands, as a flag: on one side or the other, next to it or behind that one."""
 
 
 def visible_ends(sides: Assignments, prior: ClassPrior) -> tuple[jax.Array, jax.Array]:
@@ -79,17 +92,51 @@ def find_rows(
         second = (distance > config.row_distance_m) & (distance <= 2 * config.row_distance_m)
         first = first & parallel & (shift <= config.row_shift_m)
         second = second & parallel & (shift <= 2 * config.row_shift_m)
-        on_left = jnp.where(
-            first, jnp.uint32(LEFT), jnp.where(second, jnp.uint32(SECOND_LEFT), jnp.uint32(0))
-        )
-        return jnp.where(side > 0, on_left, RIGHT * on_left)
+        return _place(first, second, side > 0)
 
-    index, num = compact(may_be, may_be.shape[0])
-    places = join_pairs(take(ends, index), num, place_of)
-    in_row = jnp.zeros(may_be.shape[0], bool)
-    for two in (LEFT | RIGHT, LEFT | SECOND_LEFT, RIGHT | SECOND_RIGHT):
-        in_row = in_row | ((places & two) == two)
-    return jnp.zeros_like(may_be).at[index].set(in_row, mode="drop")
+    return _in_threes(ends, may_be, place_of)
+
+
+def find_lines(boxes: jax.Array, early: jax.Array, may_be: jax.Array, config: VehicleConfig) -> jax.Array:
+    """Which boxes are in a line of three or more vehicles nose to tail.
+
+    Args:
+      boxes: (P, 5) float32: x, y, length, width (m), yaw (rad).
+      early: (P,) float32, their scores by rays and size.
+      may_be: (P,) bool, those that count.
+      config: how many lengths apart neighbours stand.
+
+    Returns:
+      (P,) bool: between two neighbours, or before one that has another one before it.
+
+    Reference: oracle `jaxbox.reference.find_lines`.
+    """
+
+    def place_of(own: jax.Array, other: jax.Array) -> jax.Array:
+        (x, y, length, _, yaw), (other_x, other_y, other_length, _, other_yaw) = own, other
+        dx, dy, cos, sin = other_x - x, other_y - y, jnp.cos(yaw), jnp.sin(yaw)
+        ahead, aside = dx * cos + dy * sin, jnp.abs(dy * cos - dx * sin)
+        lengths = jnp.abs(ahead) / ((length + other_length) / 2)
+        aligned = (aside < MAX_ASIDE_M) & (jnp.abs(jnp.sin(other_yaw - yaw)) < MAX_LINE_SINE)
+        first = (lengths > NEAREST_LENGTHS) & (lengths < config.line_lengths)
+        second = (lengths > 2 * NEAREST_LENGTHS) & (lengths < 2 * config.line_lengths)
+        return _place(aligned & first, aligned & second, ahead > 0)
+
+    return _in_threes(boxes, may_be & (early > MIN_EARLY), place_of)
+
+
+def _place(first: jax.Array, second: jax.Array, on_one_side: jax.Array) -> jax.Array:
+    flag = jnp.where(first, jnp.uint32(ONE_SIDE), jnp.where(second, jnp.uint32(SECOND), jnp.uint32(0)))
+    return jnp.where(on_one_side, flag, OTHER_SIDE * flag)
+
+
+def _in_threes(
+    rows: jax.Array, may_be: jax.Array, place_of: Callable[[jax.Array, jax.Array], jax.Array]
+) -> jax.Array:
+    """(P,) bool: rows (P, ...) between two neighbours, or beside one that has another one behind it."""
+    places = join_some(rows, may_be, place_of)
+    pairs = ONE_SIDE | OTHER_SIDE, ONE_SIDE | SECOND, OTHER_SIDE | OTHER_SECOND
+    return functools.reduce(jnp.logical_or, [(places & two) == two for two in pairs])
 
 
 def hit_share(rays: RayFractions, in_row: jax.Array) -> jax.Array:

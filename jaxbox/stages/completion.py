@@ -226,7 +226,8 @@ def _judge_assignments(
         closed = closed_free_length(rays, prior_of(config.vehicles.classes, label))
         rays = dataclasses.replace(rays, hit=hit_share(rays, in_row), free_length=closed)
         agreement = point_agreement(boxes, *points.table(cluster), config.completion)
-        return choose_placement(score, agreement, rays, config.completion)
+        placement, objective = choose_placement(score, agreement, rays, config.completion)
+        return placement, objective + config.completion.row_preference * in_row.astype(jnp.float32)
 
     def note(tables: Any, _: jax.Array, rows: tuple[jax.Array, ...]) -> Any:
         entry, *found = rows

@@ -12,7 +12,7 @@ from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, VehicleC
 from jaxbox.geometry.planar import wrap_yaw
 from jaxbox.stages._assignments import share_seen
 from jaxbox.stages._priors import asymmetric_gaussian, closed_free_length, prior_of, size_score
-from jaxbox.stages._rows import hit_share
+from jaxbox.stages._rows import find_lines, hit_share
 from jaxbox.stages._suppression import non_max_suppression
 from jaxbox.stages._surroundings import cluster_alone, count_points_around, sensor_from
 from jaxbox.stages.state import (
@@ -105,8 +105,8 @@ def score_boxes(
         return rectangle, *of_hypothesis, take(score, chosen), box.measured, box.in_row, is_open
 
     picked = map_rows(pick, chosen, num_rows=num)
-    rectangle, label, cluster, early, *_ = picked
-    around = _look_around(rectangle, label, cluster, early, num, clusters, obstacles, config)
+    rectangle, label, cluster, early, _, in_row, _ = picked
+    around = _look_around(rectangle, label, cluster, early, in_row, num, clusters, obstacles, config)
 
     def finish(rows: tuple[Any, ...]) -> Candidates:
         rectangle, label, cluster, score, measured, in_row, is_open, around = rows
@@ -165,19 +165,24 @@ def _look_around(
     label: jax.Array,
     cluster: jax.Array,
     early: jax.Array,
+    in_row: jax.Array,
     num: jax.Array,
     clusters: Clusters,
     obstacles: Obstacles,
     config: DetectorConfig,
 ) -> NeighbourhoodCounts:
-    """Counts of the points in and round each box; of its cluster alone where the preset asks for no more."""
+    """Counts of the points in and round each box; of its cluster alone where the preset asks for no more.
+
+    Between neighbours what is round a box is theirs: the surer the box is, the less it counts.
+    """
+    num_points = take(clusters.num_points, cluster).astype(jnp.float32)
     if not config.vehicles.neighbourhood:
-        num_points = take(clusters.num_points, cluster).astype(jnp.float32)
         return cluster_alone(num_points, take(clusters.high[:, 2], cluster))
-    prior, num_points = prior_of(config.vehicles.classes, label), take(clusters.num_points, cluster)
-    dense = jnp.minimum(num_points.astype(jnp.float32) / config.vehicles.saturation_points, 1)
-    sure = early * dense**2
-    return count_points_around(rectangle, prior, sure, num, obstacles, config.vehicles, config.region)
+    prior = prior_of(config.vehicles.classes, label)
+    sure = early * jnp.minimum(num_points / config.vehicles.saturation_points, 1) ** 2
+    around = count_points_around(rectangle, prior, sure, num, obstacles, config.vehicles, config.region)
+    in_threes = in_row | find_lines(rectangle, early, label == 0, config.vehicles)
+    return around.with_ring(jnp.where(in_threes, 1 - sure, 1) * around.num_ring)
 
 
 def _distances_outside(rectangles: jax.Array) -> list[jax.Array]:

@@ -329,8 +329,12 @@ class NeighbourhoodCounts:
 
     @property
     def num_ring(self) -> jax.Array:
-        """(P,) points of vehicle height just outside, but for those behind the box."""
+        """(P,) points of vehicle height just outside, but for those behind the box, as far as they count."""
         return self.rows[:, 3]
+
+    def with_ring(self, num_ring: jax.Array) -> "NeighbourhoodCounts":
+        """The same, with other numbers (P,) of points just outside."""
+        return NeighbourhoodCounts(self.rows.at[:, 3].set(num_ring))
 
     @property
     def num_upper(self) -> jax.Array:

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 
 from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.indexing import scatter, take
 from jaxbox.xla.loops import for_chunks, whole_chunks
+from jaxbox.xla.rows import compact
 
 Relation = Callable[[jax.Array, jax.Array], jax.Array]
 """What one row is to another, (): a truth value, or flags as uint32."""
@@ -43,6 +45,24 @@ def join_pairs(rows: jax.Array, num_rows: jax.Array, relation: Relation) -> jax.
 
     words = for_chunks(num_rows, chunk, add_row, jnp.zeros(rows.shape[0], jnp.uint32), capacity=capacity)
     return words[:capacity]
+
+
+def join_some(rows: jax.Array, mask: jax.Array, relation: Relation) -> jax.Array:
+    """The same for the rows that a mask picks. Law: those of `join_pairs` of ``rows[mask]``, and 0 elsewhere.
+
+    Args:
+      rows: (P, ...).
+      mask: (P,) bool, which rows count.
+      relation: of two rows, or of a row to itself.
+
+    Returns:
+      (P,) uint32.
+    """
+    if on_accelerator():
+        return _join(relation, rows, rows, mask[:, None] & mask[None])
+    index, num = compact(mask, mask.shape[0])
+    words = join_pairs(take(rows, index), num, relation)
+    return scatter("set", jnp.zeros_like(words), index, words)
 
 
 def all_pairs(relation: Relation, first: jax.Array, second: jax.Array) -> jax.Array:
