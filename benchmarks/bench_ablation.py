@@ -97,8 +97,7 @@ ABLATIONS = (
     Ablation("rows of vehicles side by side as others", {
         "completion.row_distance_m": 0.0, "completion.row_shift_m": 0.0,
     }),
-    Ablation("boxes in rows not preferred to boxes along them", {"completion.row_preference": 0.0}),
-    Ablation("boxes in rows not preferred to boxes along them", {"completion.row_preference": 0.0}),
+    Ablation("boxes along rows at no cost", {"completion.along_row_cost": 0.0}),
     Ablation("lines of vehicles nose to tail as others", {"vehicles.line_lengths": 0.0}),
     Ablation("evidence from 2 m on", {"evidence.min_range_m": 2.0}),
     Ablation("no lowest box height", {"vehicles.classes.0.min_box_height_m": 0.0}),

@@ -316,9 +316,8 @@ class CompletionConfig:
     to the next it is at most this far,"""
     row_shift_m: Scalar = 0.7
     """and one stands at most this much farther forward than the other."""
-    row_preference: Scalar = 0.2
-    """Added to the objective of a box in such a row: read along the row instead, it would reach over the ends
-    of its neighbours."""
+    along_row_cost: Scalar = 0.05
+    """Cost of a box along such a row, in place of one in it: it would reach over its neighbours' ends."""
 
 
 @config_class

@@ -217,8 +217,8 @@ def complete_box(
             rays = dataclasses.replace(rays, hit=hit, free_length=free_length)
             agreement = point_agreement(placed, xy, config)
             placement, objective = choose_placement(rectangle.score, agreement, rays, config)
-            if between:
-                objective += float(config.row_preference)
+            if (i, 1 - side) in in_row:
+                objective -= float(config.along_row_cost)
             box = place(sides, likely_sizes(sides, prior, config), placement, objective)
             boxes.append(dataclasses.replace(box, in_row=between))
     return blend_boxes(boxes, max_loss=config.blend_objective) if boxes else None

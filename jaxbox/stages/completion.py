@@ -226,8 +226,7 @@ def _judge_assignments(
         closed = closed_free_length(rays, prior_of(config.vehicles.classes, label))
         rays = dataclasses.replace(rays, hit=hit_share(rays, in_row), free_length=closed)
         agreement = point_agreement(boxes, *points.table(cluster), config.completion)
-        placement, objective = choose_placement(score, agreement, rays, config.completion)
-        return placement, objective + config.completion.row_preference * in_row.astype(jnp.float32)
+        return choose_placement(score, agreement, rays, config.completion)
 
     def note(tables: Any, _: jax.Array, rows: tuple[jax.Array, ...]) -> Any:
         entry, *found = rows
@@ -245,6 +244,9 @@ def _judge_assignments(
     rows, absent = (entry, *judged, in_row), (num_entries, 0, 0.0, False)
     of_entry = fold_rows(note, nothing, rows, num_rows=num, absent=absent)
     placement, objective, in_row = (a.reshape(-1, num_each) for a in of_entry)
+    # The other side of a rectangle is the length of a box along the row.
+    along_row = in_row.reshape(-1, len(candidates), NUM_ASSIGNMENTS)[..., ::-1].reshape(in_row.shape)
+    objective = objective - config.completion.along_row_cost * along_row.astype(jnp.float32)
     return placement, objective, in_row, num
 
 
