@@ -24,6 +24,7 @@ IN_SHORT = {
     "beside a wall: 0.2 m": 6,
     "beside a hedge: 0.2 m": 6,
     "rows, side by side: gaps of 0.2 m": 5,
+    "rows, side by side: gaps of 0.3 m": 5,
     "rows, nose to tail: gaps of 0.2 m": 5,
     "very near: middle 3 m away": 13,
     "under a ceiling: 2.3 m": 6,

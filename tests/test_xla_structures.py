@@ -458,7 +458,7 @@ def test_words_of_a_row_join_what_it_is_to_each_row_that_counts(size):
     def relation(own, other):
         return jnp.asarray(flags)[(own[0] + 3 * other[1]) % 100]
 
-    join = jax.jit(lambda num: pairs.join_pairs(jnp.asarray(rows), num, relation))
+    join = jax.jit(lambda num: pairs.join_pairs(jnp.asarray(rows), jnp.arange(size) < num, relation))
     for num in {0, 1, size // 2, size}:
         words = flags[(rows[:num, None, 0] + 3 * rows[None, :num, 1]) % 100]
         expected = np.zeros(size, np.uint32)
@@ -472,7 +472,7 @@ def test_rows_that_a_mask_picks_are_joined_with_each_other_alone(share):
     rng = np.random.default_rng(0)
     rows, mask = rng.integers(0, 32, 200).astype(np.uint32), rng.uniform(size=200) < share
     join = jax.jit(
-        lambda mask: pairs.join_some(jnp.asarray(rows), mask, lambda own, other: own ^ (1 << other))
+        lambda mask: pairs.join_pairs(jnp.asarray(rows), mask, lambda own, other: own ^ (1 << other))
     )
     each = np.uint32(rows[:, None] ^ (np.uint32(1) << rows[None, :]))
     expected = np.where(mask, np.bitwise_or.reduce(each[:, mask], axis=1, initial=0), 0)

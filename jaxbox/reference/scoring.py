@@ -63,14 +63,14 @@ def score_boxes(
     """
     in_row = np.array([box.in_row for box in completed.boxes], bool)
     early = _early_scores(completed, rays, clusters, in_row, config.vehicles)
-    in_line = _in_lines(completed, early, config.vehicles)
+    in_threes = in_row | _in_lines(completed, early, config.vehicles)
     is_open = np.ones(len(early)) if rays is None else rays[0].open
 
     def judge(row: int, hypothesis: ClassHypothesis, box: CompletedBox) -> Candidate:
         cluster, prior = clusters[hypothesis.cluster], config.vehicles.classes[hypothesis.label]
         score = float(early[row])
-        in_threes = bool(in_row[row] or in_line[row])
-        around = _look_around(box.box, prior, cluster, score, in_threes, obstacles, config.vehicles)
+        between_others = bool(in_threes[row])
+        around = _look_around(box.box, prior, cluster, score, between_others, obstacles, config.vehicles)
         if config.vehicles.neighbourhood and config.completion.mode != "none":
             ended, seen = _end_where_seen(box, around, float(prior.length_m), config)
             box = box if box.in_row else dataclasses.replace(box, box=ended)
@@ -143,7 +143,7 @@ def _look_around(
     prior: ClassPrior,
     cluster: Cluster,
     early: float,
-    in_threes: bool,
+    between_others: bool,
     obstacles: Obstacles,
     config: VehicleConfig,
 ) -> NeighbourhoodCounts:
@@ -151,7 +151,7 @@ def _look_around(
         return cluster_alone(len(cluster.members), cluster.top_m)
     sure = early * min(len(cluster.members) / float(config.saturation_points), 1.0) ** 2
     around = count_points_around(box, prior, obstacles, config, sure=sure)
-    return dataclasses.replace(around, num_ring=(1 - sure) * around.num_ring) if in_threes else around
+    return dataclasses.replace(around, num_ring=(1 - sure) * around.num_ring) if between_others else around
 
 
 def _end_where_seen(

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxbox.config import ClassPrior, CompletionConfig, VehicleConfig
 from jaxbox.stages._assignments import Assignments
 from jaxbox.stages.state import RayFractions
-from jaxbox.xla.pairs import join_some
+from jaxbox.xla.pairs import join_pairs
 
 NARROWEST, WIDEST = 0.8, 1.15
 """The visible end of a vehicle is so wide, as a fraction of the class's width."""
@@ -134,7 +134,7 @@ def _in_threes(
     rows: jax.Array, may_be: jax.Array, place_of: Callable[[jax.Array, jax.Array], jax.Array]
 ) -> jax.Array:
     """(P,) bool: rows (P, ...) between two neighbours, or beside one that has another one behind it."""
-    places = join_some(rows, may_be, place_of)
+    places = join_pairs(rows, may_be, place_of)
     pairs = ONE_SIDE | OTHER_SIDE, ONE_SIDE | SECOND, OTHER_SIDE | OTHER_SECOND
     return functools.reduce(jnp.logical_or, [(places & two) == two for two in pairs])
 

@@ -16,20 +16,26 @@ Relation = Callable[[jax.Array, jax.Array], jax.Array]
 """What one row is to another, (): a truth value, or flags as uint32."""
 
 
-def join_pairs(rows: jax.Array, num_rows: jax.Array, relation: Relation) -> jax.Array:
+def join_pairs(rows: jax.Array, mask: jax.Array, relation: Relation) -> jax.Array:
     """What each row is to any other. Law: word i has the bits of all ``relation(rows[i], rows[j])``.
 
     Args:
       rows: (P, ...).
-      num_rows: () int32, how many rows count.
+      mask: (P,) bool, which rows count.
       relation: of two rows, or of a row to itself.
 
     Returns:
       (P,) uint32; 0 for rows that do not count.
     """
     if on_accelerator():
-        valid = jnp.arange(rows.shape[0], dtype=jnp.int32) < num_rows
-        return _join(relation, rows, rows, valid[:, None] & valid[None])
+        return _join(relation, rows, rows, mask[:, None] & mask[None])
+    index, num = compact(mask, mask.shape[0])
+    words = _join_chunks(take(rows, index), num, relation)
+    return scatter("set", jnp.zeros_like(words), index, words)
+
+
+def _join_chunks(rows: jax.Array, num_rows: jax.Array, relation: Relation) -> jax.Array:
+    """The same of the first rows, chunk after chunk of those that count."""
     capacity, chunk = rows.shape[0], chunks.PAIRS
     rows = whole_chunks(rows, chunk)
     row, num = jnp.arange(chunk, dtype=jnp.uint32), jnp.uint32(num_rows)
@@ -45,24 +51,6 @@ def join_pairs(rows: jax.Array, num_rows: jax.Array, relation: Relation) -> jax.
 
     words = for_chunks(num_rows, chunk, add_row, jnp.zeros(rows.shape[0], jnp.uint32), capacity=capacity)
     return words[:capacity]
-
-
-def join_some(rows: jax.Array, mask: jax.Array, relation: Relation) -> jax.Array:
-    """The same for the rows that a mask picks. Law: those of `join_pairs` of ``rows[mask]``, and 0 elsewhere.
-
-    Args:
-      rows: (P, ...).
-      mask: (P,) bool, which rows count.
-      relation: of two rows, or of a row to itself.
-
-    Returns:
-      (P,) uint32.
-    """
-    if on_accelerator():
-        return _join(relation, rows, rows, mask[:, None] & mask[None])
-    index, num = compact(mask, mask.shape[0])
-    words = join_pairs(take(rows, index), num, relation)
-    return scatter("set", jnp.zeros_like(words), index, words)
 
 
 def all_pairs(relation: Relation, first: jax.Array, second: jax.Array) -> jax.Array:
