@@ -90,5 +90,9 @@ def test_a_soak_ends_where_a_sweep_fails_and_the_slope_is_that_of_the_memory():
     with pytest.raises(SystemExit, match="bad: the disk is gone"):
         soak._check(failed)
     memory = [(frame, 500_000 + (0 if frame < 100 else 2 * frame)) for frame in range(0, 1000, 10)]
-    assert soak.growth(memory, 1000)["growth_kb_per_1000_frames"] == pytest.approx(2000)
+    grown = soak.growth(memory, 1000)
+    assert grown["growth_kb_per_1000_frames"] == pytest.approx(2000)
+    assert grown["median_mb_of_tenths"] == pytest.approx(
+        [500 + (0.2 * k + 0.09 if k else 0) for k in range(10)]
+    )
     assert soak.latency(range(1001))["p99.9"] == pytest.approx(999)
