@@ -183,9 +183,11 @@ def growth(memory: Sequence[tuple[int, int]], frames: int) -> dict[str, Any]:
     frame, kilobytes = np.array(memory, float).T
     settled = frame >= SETTLED_SHARE * frames
     slope, _ = np.polyfit(frame[settled], kilobytes[settled], 1)
+    # A short run has fewer readings than tenths.
+    tenths = np.array_split(kilobytes, min(10, len(kilobytes)))
     return {
         "growth_kb_per_1000_frames": float(1000 * slope),
-        "median_mb_of_tenths": [float(np.median(part) / 1e3) for part in np.array_split(kilobytes, 10)],
+        "median_mb_of_tenths": [float(np.median(part) / 1e3) for part in tenths],
     }
 
 
