@@ -248,6 +248,8 @@ def print_report(report: dict[str, Any]) -> None:
     """The figures of the runs side by side."""
     names = [name for name, value in report["real"].items() if isinstance(value, int | float)]
     rows = [(name, *(report[run][name] for run in report)) for name in names]
+    medians = itertools.zip_longest(*(report[run]["median_mb_of_tenths"] for run in report), fillvalue="")
+    rows += [(f"median_mb_of_tenth_{k}", *values) for k, values in enumerate(medians, 1)]
     for name in report["real"]["frame_ms"]:
         rows.append((f"{name} of a frame, ms", *(report[run]["frame_ms"][name] for run in report)))
     common.print_table(["", *report], rows)

@@ -639,11 +639,8 @@ def soak() -> str:
     first = "small synthetic sweeps" if report["circumstances"]["options"]["quick"] else "real sweeps"
     names = {"real": first, "varied": "any size", "tracked": "drives, tracked"}
     runs = {name: report[run] for run, name in names.items() if run in report}
-
-    def tenths(run: dict[str, Any]) -> str:
-        return " ".join(f"{median:.0f}" for median in run["median_mb_of_tenths"])
-
     points = ["{:,} to {:,}".format(*sorted(run["points"].values())[::2]) for run in runs.values()]
+    memory = [" ".join(f"{median:.0f}" for median in run["median_mb_of_tenths"]) for run in runs.values()]
     rows: list[tuple[Any, ...]] = [
         ("frames", *(f"{run['frames']:,}" for run in runs.values())),
         ("points of a frame", *points),
@@ -652,7 +649,7 @@ def soak() -> str:
             "growth of memory, kB per 1,000 frames",
             *(run["growth_kb_per_1000_frames"] for run in runs.values()),
         ),
-        ("memory, tenths, MB", *(tenths(run) for run in runs.values())),
+        ("memory, tenths, MB", *memory),
         ("peak of memory, MB", *(run["peak_mb"] for run in runs.values())),
     ]
     for name in report["real"]["frame_ms"]:
