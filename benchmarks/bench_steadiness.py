@@ -8,6 +8,7 @@ copies of itself. No label is used: a box of the sweep as recorded stays where t
 the same class at or above the default score threshold, and their IoU in the bird's-eye view is .7 or more.
 """
 
+import itertools
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -108,22 +109,24 @@ def measure_boxes(config: DetectorConfig, sweeps: Sequence[Sweep], draws: int, s
     return {change: tally.to_dict() for change, tally in tallies.items()}
 
 
-def measure_tracks(config: DetectorConfig, limit: int | None) -> dict[str, Any]:
-    """The shares of the boxes of the tracks that each sweep saw, by change."""
+def measure_tracks(config: DetectorConfig, draws: int, limit: int | None) -> dict[str, Any]:
+    """The shares of the boxes of each sweep's tracks, by change."""
     root = common.data_folder("kitti_tracking") / "training"
     tallies = {change: Tally() for change in CHANGES}
     for _, sweeps in group_sequences(open_sweeps(root)):
         chosen = sweeps[:limit]
-        before = list(track_boxes(chosen, config, ""))
-        for change, tally in tallies.items():
-            for rows, after in zip(before, track_boxes(chosen, config, change), strict=True):
-                tally.add(rows, *judge(rows, after))
+        before = list(track_boxes(chosen, config, "", 0))
+        for change, draw in itertools.product(CHANGES, range(draws)):
+            for rows, after in zip(before, track_boxes(chosen, config, change, draw), strict=True):
+                tallies[change].add(rows, *judge(rows, after))
     return {change: tally.to_dict() for change, tally in tallies.items()}
 
 
-def track_boxes(sweeps: Sequence[Sweep], config: DetectorConfig, change: str) -> Iterator[np.ndarray]:
+def track_boxes(
+    sweeps: Sequence[Sweep], config: DetectorConfig, change: str, draw: int
+) -> Iterator[np.ndarray]:
     """The rows of each sweep's tracks."""
-    clouds = (changed(sweep, change, 0) for sweep in sweeps)
+    clouds = (changed(sweep, change, draw) for sweep in sweeps)
     for tracked in jaxbox.track(clouds, config, poses=find_poses(sweeps)):
         if tracked.tracks is None:
             raise SystemExit(f"{tracked.name}: {tracked.error}")
@@ -155,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if "boxes" in options.parts:
         report["boxes"] = measure_boxes(config, sweeps, draws, options.lost)
     if "tracks" in options.parts:
-        report["tracks"] = measure_tracks(config, limit)
+        report["tracks"] = measure_tracks(config, draws, limit)
     print_report(report)
     common.write_report(report, options)
 

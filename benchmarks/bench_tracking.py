@@ -9,9 +9,9 @@ one threshold is chosen on the nine others.
     python -m benchmarks.bench_tracking --parts real
 
 Chosen on these drives too, the real ones among them, are the share of a side that counts as seen (.8), the
-correlation of profiles (.15), the second pass's memory of heights (.2 s) and belief in few detections (4),
-and that it shows the track's own box of what moves. The settings for the trained detector's boxes were chosen
-on all ten sequences; only the threshold leaves one out.
+correlation of profiles (.15), the score of what is not seen (``unseen_sd_m``), the second pass's memory of
+heights (.2 s) and belief in few detections (4), and that it shows the track's own box of what moves. The
+settings for the trained detector's boxes were chosen on all ten sequences; only the threshold leaves one out.
 """
 
 import argparse
@@ -89,13 +89,8 @@ def boxes_of(tracks: Tracks, chosen: Any) -> FrameBoxes:
     )
 
 
-def seen_boxes(tracked: Sequence[TrackedSweep]) -> list[FrameBoxes]:
-    """The tracks that each sweep saw."""
-    return [boxes_of(tracks, seen_only(tracks).valid) for tracks in (s.tracks for s in checked(tracked))]
-
-
 def all_boxes(tracked: Sequence[TrackedSweep]) -> list[FrameBoxes]:
-    """All tracks of each sweep, those of filled gaps too."""
+    """All tracks of each sweep, those that it did not see too."""
     return [boxes_of(sweep.tracks, sweep.tracks.valid) for sweep in checked(tracked)]
 
 
@@ -134,7 +129,7 @@ def side_by_side(
     """Single sweeps, online and offline."""
     kinds = {
         "single sweep": [FrameBoxes.of_detections(sweep.detections) for sweep in checked(tracked)],
-        "online": seen_boxes(tracked),
+        "online": all_boxes(tracked),
         "offline": all_boxes(smoothed),
     }
     rows: dict[str, Any] = {kind: row({name: truth}, {name: boxes}) for kind, boxes in kinds.items()}
@@ -160,7 +155,7 @@ def measure_real(config: DetectorConfig, poses: str | None) -> dict[str, Any]:
         poses_of = {"poses": str(tracked[0].pose_source)}
         found[name] = side_by_side(name, truth, tracked, smoothed) | poses_of
         of_sweeps = [labels.get(sweep.frame or 0, []) for sweep in sweeps]
-        online = [seen_only(of_sweep.tracks) for of_sweep in checked(tracked)]
+        online = [of_sweep.tracks for of_sweep in checked(tracked)]
         offline = [of_sweep.tracks for of_sweep in checked(smoothed)]
         for kind, tracks in (("online", online), ("offline", offline)):
             found[name][kind]["figures"]["HOTA Car 2D"] = hota_in_image(of_sweeps, tracks, calibration)

@@ -63,7 +63,7 @@ _POSITIVE = """
     vehicles.classes.count_max_height_m
     vehicles.saturation_points vehicles.support_points vehicles.support_range_m vehicles.recess_share
     vehicles.free_scale vehicles.objective_softness vehicles.overhead_gap_m
-    gate acceleration_mps2 position_sd_m birth_speed_sd_mps max_gap_s max_ego_speed_mps
+    gate acceleration_mps2 position_sd_m unseen_sd_m birth_speed_sd_mps max_gap_s max_ego_speed_mps
 """
 """Divisors, and what leaves nothing to find at zero. Zero for a map's greatest height turns the map off."""
 

@@ -316,7 +316,7 @@ class CompletionConfig:
     to the next it is at most this far,"""
     row_shift_m: Scalar = 0.7
     """and one stands at most this much farther forward than the other."""
-    along_row_cost: Scalar = 0.05
+    along_row_cost: Scalar = 0.1
     """Cost of a box along such a row, in place of one in it: it would reach over its neighbours' ends."""
 
 

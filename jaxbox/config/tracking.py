@@ -37,6 +37,9 @@ class TrackConfig:
     """A track is hidden where more than this share of the azimuths over its box has a nearer return,"""
     hidden_gap_m: Scalar = 0.7
     """nearer than the box by more than this."""
+    unseen_sd_m: Scalar = 0.35
+    """A track that the sweep did not see scores less the less its place is known: x exp(-(sd / this)^2), sd
+    the standard deviation of where it is expected, m."""
     yaw_memory: Scalar = 0.95
     """What of the yaw's votes remains after a sweep while the vehicle stands,"""
     yaw_memory_moving: Scalar = 0.8

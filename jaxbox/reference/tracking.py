@@ -432,10 +432,12 @@ def describe(
       The vehicle.
     """
     own = vehicle_shape.Box(track.position.copy(), track.size(), vehicle_shape.wrap_yaw(track.yaw))
-    shown, score = own, track.score_sum / track.hits
-    if row is not None:
+    mean_score = track.score_sum / track.hits
+    if row is None:
+        shown, score = own, mean_score * math.exp(-track.covariance[0, 0] / float(config.unseen_sd_m) ** 2)
+    else:
         shown = vehicle_shape.refine_box(track, seen, row)
-        score = math.sqrt(score * float(seen.score[row]))
+        score = math.sqrt(mean_score * float(seen.score[row]))
     heading, front_probability = vehicle_shape.front_of(shown.yaw, track)
     motion, shift = vehicle_motion.classify(track, tracker, config)
     missed = "HIDDEN" if track.hidden_now else "COASTING"

@@ -358,6 +358,8 @@ def _answer(
     own_center, own_size, own_yaw = shape.refine_boxes(slots, own)
     shown_yaw = jnp.where(is_seen, own_yaw, yaw)
     mean_score = slots.score_sum / jnp.maximum(slots.hits.astype(jnp.float32), 1)
+    sd_m = jnp.sqrt(slots.covariance[:, 0])
+    expected_score = mean_score * jnp.exp(-((sd_m / config.unseen_sd_m) ** 2))
     heading, front_probability = shape.front_of(shown_yaw, slots)
     motions, shift = motion.classify(slots, state.moment_age_s, config)
     missed = jnp.where(slots.hidden_now, Sight.HIDDEN.value, Sight.COASTING.value)
@@ -378,7 +380,7 @@ def _answer(
         lateral_shift_m=shift,
         label=jnp.argmax(slots.label_score, axis=1).astype(jnp.int32),
         label_probability=slots.label_score / jnp.maximum(label_sum, 1e-6),
-        score=jnp.where(is_seen, jnp.sqrt(own.score * mean_score), mean_score),
+        score=jnp.where(is_seen, jnp.sqrt(own.score * mean_score), expected_score),
         center=jnp.where(is_seen[:, None], own_center, center),
         size=jnp.where(is_seen[:, None], own_size, size),
         yaw=shown_yaw,

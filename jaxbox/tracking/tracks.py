@@ -177,7 +177,8 @@ class Tracks(BoxRows[Track]):
     """(T, L) float32, in [0, 1]: shares of the classes in the scores of its detections."""
     score: jax.Array
     """(T,) float32, in [0, 1]: mean score of its detections; where it has one in this sweep, the geometric
-    mean of that and the detection's own, which tells how good this box is."""
+    mean of that and the detection's own, which tells how good this box is; where it has none, less the less
+    its place is known (`TrackConfig.unseen_sd_m`)."""
     center: jax.Array
     """(T, 3) float32, m, sensor frame of this sweep: of the detection's box where there is one, else where
     the track is expected. After the second pass: of the track, where it moves."""
