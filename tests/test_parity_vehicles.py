@@ -104,7 +104,7 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
 def score_boxes(columns, prior):
     around = NeighbourhoodCounts(jnp.stack(columns["around"], axis=1))
     seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "rho", "objective"))
-    where = (columns[name] for name in ("rho", "reach", "seen_width", "is_open"))
+    where = (columns[name] for name in ("rho", "reach", "seen_width", "is_open", "in_threes"))
     early = scoring.evidence_score(*seen, SETTINGS)
     late, top_unseen = scoring.neighbourhood_score(around, *where, prior, SETTINGS)
     by_size = scoring.size_score(columns["length"], columns["width"], prior)
@@ -133,6 +133,7 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
         "reach": rng.uniform(0.5, 4, MAX_BOXES),
         "seen_width": rng.uniform(0, 2.5, MAX_BOXES),
         "is_open": np.maximum(rng.uniform(-0.1, 0.2, MAX_BOXES), 0),
+        "in_threes": rng.random(MAX_BOXES) < 0.3,
         "around": [
             rng.integers(1, 400, MAX_BOXES),
             np.where(rng.random(MAX_BOXES) < 0.5, prior.height_m, 1.5) + rng.normal(0, 0.5, MAX_BOXES),
@@ -143,7 +144,8 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
             rng.uniform(0, 5, MAX_BOXES),
         ],
     }
-    columns, prior = jax.tree.map(np.float32, (columns, prior))
+    floats, prior = jax.tree.map(np.float32, (columns, prior))
+    columns = floats | {"in_threes": columns["in_threes"]}
     scores, top_unseen = jax.device_get(score_boxes(columns, prior))
     expected, expected_unseen = [], []
     for row in range(MAX_BOXES):
@@ -161,9 +163,11 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
                 config=SETTINGS,
                 reach=float(columns["reach"][row]),
                 is_open=float(columns["is_open"][row]),
+                in_threes=bool(columns["in_threes"][row]),
             )
         )
-        where = (float(columns[name][row]) for name in ("rho", "reach", "seen_width", "is_open"))
+        where = [float(columns[name][row]) for name in ("rho", "reach", "seen_width", "is_open")]
+        where.append(bool(columns["in_threes"][row]))
         late = reference.neighbourhood_score(around, *where, SETTINGS.classes[label[row]], SETTINGS)
         expected_unseen.append(late[1])
     expected = np.array(expected)

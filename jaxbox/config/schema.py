@@ -391,7 +391,7 @@ class VehicleConfig:
     """score x a factor from this, where all upper points are on the faces, to 1."""
     tall_upright_score: Scalar = 0.4
     """The same for what is as high as ``ClassPrior.upright_from_m`` where nearly the class's width was
-    measured."""
+    measured, and for vehicles in rows and lines of three or more: all but one face of them is hidden."""
     support_points: Scalar = 10.0
     """score x min(1, ground points round the box / this)."""
     support_range_m: Scalar = 50.0

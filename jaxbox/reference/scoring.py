@@ -69,15 +69,15 @@ def score_boxes(
     def judge(row: int, hypothesis: ClassHypothesis, box: CompletedBox) -> Candidate:
         cluster, prior = clusters[hypothesis.cluster], config.vehicles.classes[hypothesis.label]
         score = float(early[row])
-        between_others = bool(in_threes[row])
-        around = _look_around(box.box, prior, cluster, score, between_others, obstacles, config.vehicles)
+        threes = bool(in_threes[row])
+        around = _look_around(box.box, prior, cluster, score, threes, obstacles, config.vehicles)
         if config.vehicles.neighbourhood and config.completion.mode != "none":
             ended, seen = _end_where_seen(box, around, float(prior.length_m), config)
             box = box if box.in_row else dataclasses.replace(box, box=ended)
             score *= seen + float(config.vehicles.hidden_length_score) * (1 - seen)
         rho = float(np.hypot(box.box[0], box.box[1]))
         lowest_z = obstacles.xyz[cluster.members, 2].min() if config.ground.max_planes > 1 else 0.0
-        where = rho, reach(box.box, lowest_z), box.measured_width_m, float(is_open[row])
+        where = rho, reach(box.box, lowest_z), box.measured_width_m, float(is_open[row]), threes
         late, top_unseen = neighbourhood_score(around, *where, prior, config.vehicles)
         return Candidate(hypothesis, box, around, top_unseen, score * late)
 
@@ -224,6 +224,7 @@ def score_box(
     config: VehicleConfig,
     reach: float = np.inf,
     is_open: float = 1.0,
+    in_threes: bool = False,
 ) -> float:
     """How much a box looks like a vehicle of a class: a product of factors in [0, 1].
 
@@ -238,6 +239,7 @@ def score_box(
       config: of the score.
       reach: m above the ground, height of the highest beam where the box begins.
       is_open: share of the rays that see free space in the box.
+      in_threes: whether it is one of three or more in a row or line.
 
     Returns:
       The score, without what a hidden length costs; 0 where a gate of the class closes.
@@ -252,7 +254,7 @@ def score_box(
         config=config,
     )
     rho = float(np.hypot(box.box[0], box.box[1]))
-    where = rho, reach, box.measured_width_m, is_open
+    where = rho, reach, box.measured_width_m, is_open, in_threes
     return early * neighbourhood_score(around, *where, prior, config)[0]
 
 
@@ -333,6 +335,7 @@ def neighbourhood_score(
     reach: float,
     seen_width_m: float,
     is_open: float,
+    in_threes: bool,
     prior: ClassPrior,
     config: VehicleConfig,
 ) -> tuple[float, bool]:
@@ -348,11 +351,12 @@ def neighbourhood_score(
         the class.
       is_open: share of the rays that see free space in the box: where it is less than `min_open`, what is cut
         off, or was measured to less than `WIDE` of the class's width, is rather a wall.
+      in_threes: whether it is one of three or more in a row or line, which hide all but one face of each.
       prior: of the class.
       config: exp(-(ring weight x ring + overhead weight x above) / inside), and a factor from
-        `upright_score`, or `tall_upright_score` of what is high, where no upper point is recessed, to 1 from
-        the share `recess_share` on. Points above do not count where the top is twice `overhead_gap_m` below
-        `count_max_height_m`.
+        `upright_score`, or `tall_upright_score` of what is high or in threes, where no upper point is
+        recessed, to 1 from the share `recess_share` on. Points above do not count where the top is twice
+        `overhead_gap_m` below `count_max_height_m`.
 
     Returns:
       In [0, 1], 0 where a gate of the class closes; and whether it is that of a box whose top is out of
@@ -379,7 +383,8 @@ def neighbourhood_score(
     share = share / (around.num_upper + PSEUDO_COUNT)
     tall = np.interp(around.top - prior.upright_from_m, [0, UPRIGHT_RAMP_M], [0, 1])
     tall *= np.interp(seen_width, NEARLY_WIDE, [0, 1])
-    least = config.upright_score + (config.tall_upright_score - config.upright_score) * tall
+    may_be = 1.0 if in_threes else tall
+    least = config.upright_score + (config.tall_upright_score - config.upright_score) * may_be
     upright = least + (1 - least) * min(1.0, share / config.recess_share)
     return float(score * upright), unseen > seen
 

@@ -106,10 +106,13 @@ def score_boxes(
 
     picked = map_rows(pick, chosen, num_rows=num)
     rectangle, label, cluster, early, _, in_row, _ = picked
-    around = _look_around(rectangle, label, cluster, early, in_row, num, clusters, obstacles, config)
+    in_threes = in_row
+    if settings.neighbourhood:
+        in_threes = in_threes | find_lines(rectangle, early, label == 0, settings)
+    around = _look_around(rectangle, label, cluster, early, in_threes, num, clusters, obstacles, config)
 
     def finish(rows: tuple[Any, ...]) -> Candidates:
-        rectangle, label, cluster, score, measured, in_row, is_open, around = rows
+        rectangle, label, cluster, score, measured, in_row, is_open, around, in_threes = rows
         if config.vehicles.neighbourhood and config.completion.mode != "none":
             ended, seen = _end_where_seen(rectangle, label, measured[:, 0], around, config)
             rectangle = jnp.where(in_row[:, None], rectangle, ended)
@@ -118,13 +121,13 @@ def score_boxes(
         ground = ground_elevation(jnp.concatenate([rectangle[:, :2], z[:, None]], axis=1))
         nearest = jnp.hypot(*_distances_outside(rectangle))
         reach = NOT_CUT_M * jnp.ones_like(ground) if steepest is None else steepest * nearest - ground
-        row = rectangle, label, cluster, score, measured[:, 1], is_open, around
+        row = rectangle, label, cluster, score, measured[:, 1], is_open, around, in_threes
         candidates = _finish(row, reach, clusters, settings)
         return dataclasses.replace(candidates, bottom=candidates.bottom + ground)
 
     # Many at a time where they are looked up in the ground grid, see `map_rows`.
     chunk = chunks.BOXES if config.ground.surface else 1
-    candidates = map_rows(finish, (*picked, around), num_rows=num, chunk=chunk)
+    candidates = map_rows(finish, (*picked, around, in_threes), num_rows=num, chunk=chunk)
     order = best_first(candidates.score, num)
     ordered = map_rows(lambda row: jax.tree.map(lambda a: take(a, row), candidates), order, num_rows=num)
     return dataclasses.replace(ordered, num=num)
@@ -165,7 +168,7 @@ def _look_around(
     label: jax.Array,
     cluster: jax.Array,
     early: jax.Array,
-    in_row: jax.Array,
+    in_threes: jax.Array,
     num: jax.Array,
     clusters: Clusters,
     obstacles: Obstacles,
@@ -181,7 +184,6 @@ def _look_around(
     prior = prior_of(config.vehicles.classes, label)
     sure = early * jnp.minimum(num_points / config.vehicles.saturation_points, 1) ** 2
     around = count_points_around(rectangle, prior, sure, num, obstacles, config.vehicles, config.region)
-    in_threes = in_row | find_lines(rectangle, early, label == 0, config.vehicles)
     return around.with_ring(jnp.where(in_threes, 1 - sure, 1) * around.num_ring)
 
 
@@ -208,10 +210,11 @@ def _end_where_seen(
 
 def _finish(rows: tuple[Any, ...], reach: jax.Array, clusters: Clusters, config: VehicleConfig) -> Candidates:
     """Candidates with their score and height, bottoms above the ground, in the order that they came in."""
-    rectangle, label, cluster, score, seen_width_m, is_open, around = rows
+    rectangle, label, cluster, score, seen_width_m, is_open, around, in_threes = rows
     prior = prior_of(config.classes, label)
     rho = jnp.linalg.norm(rectangle[:, :2], axis=1)
-    late, top_unseen = neighbourhood_score(around, rho, reach, seen_width_m, is_open, prior, config)
+    where = rho, reach, seen_width_m, is_open, in_threes
+    late, top_unseen = neighbourhood_score(around, *where, prior, config)
     height = jnp.maximum(around.top + config.top_margin_m, prior.min_box_height_m)
     height = jnp.where(top_unseen, jnp.maximum(height, prior.height_m), height)
     bottom = jnp.zeros_like(height)
@@ -334,6 +337,7 @@ def neighbourhood_score(
     reach: jax.Array,
     seen_width_m: jax.Array,
     is_open: jax.Array,
+    in_threes: jax.Array,
     prior: ClassPrior,
     config: VehicleConfig,
 ) -> tuple[jax.Array, jax.Array]:
@@ -354,6 +358,8 @@ def neighbourhood_score(
       seen_width_m: (P,) float32, m: what was measured of the width. Of one long face nothing is known but its
         length, which walls have too: only from half the usual width on may the top be out of sight.
       is_open: (P,) float32, fraction of the rays that see free space inside.
+      in_threes: (P,) bool, whether vehicles stand on both sides, or it is at the end of such a row or line:
+        they hide all but one face, and nothing is seen to lie behind it.
       prior: fields of (P,) float32.
       config: exp(-(ring weight x ring + overhead weight x above) / inside), and what upright boxes lose:
         those with few upper points come near to the full score. Points above count as far as they are
@@ -378,17 +384,18 @@ def neighbourhood_score(
     score = score * jnp.exp(-clutter)
     recessed = around.num_recessed + PSEUDO_COUNT * config.recess_share
     recessed = recessed / (around.num_upper + PSEUDO_COUNT)
-    least = _upright_score(around.top, seen_width, prior, config)
+    least = _upright_score(around.top, seen_width, in_threes, prior, config)
     upright = least + (1 - least) * jnp.minimum(recessed / config.recess_share, 1)
     return score * upright, top_unseen
 
 
 def _upright_score(
-    top: jax.Array, seen_width: jax.Array, prior: ClassPrior, config: VehicleConfig
+    top: jax.Array, seen_width: jax.Array, in_threes: jax.Array, prior: ClassPrior, config: VehicleConfig
 ) -> jax.Array:
     """(P,) the factor of what is upright all over; `seen_width` is a fraction of the class's."""
     tall = jnp.clip((top - prior.upright_from_m) / UPRIGHT_RAMP_M, 0, 1) * _nearly_wide(seen_width)
-    return config.upright_score + (config.tall_upright_score - config.upright_score) * tall
+    may_be = jnp.where(in_threes, 1, tall)
+    return config.upright_score + (config.tall_upright_score - config.upright_score) * may_be
 
 
 def _nearly_wide(seen_width: jax.Array) -> jax.Array:
