@@ -155,9 +155,8 @@ def measure_real(config: DetectorConfig, poses: str | None) -> dict[str, Any]:
         poses_of = {"poses": str(tracked[0].pose_source)}
         found[name] = side_by_side(name, truth, tracked, smoothed) | poses_of
         of_sweeps = [labels.get(sweep.frame or 0, []) for sweep in sweeps]
-        online = [of_sweep.tracks for of_sweep in checked(tracked)]
-        offline = [of_sweep.tracks for of_sweep in checked(smoothed)]
-        for kind, tracks in (("online", online), ("offline", offline)):
+        for kind, sweeps_of_kind in (("online", tracked), ("offline", smoothed)):
+            tracks = [of_sweep.tracks for of_sweep in checked(sweeps_of_kind)]
             found[name][kind]["figures"]["HOTA Car 2D"] = hota_in_image(of_sweeps, tracks, calibration)
     return found
 

@@ -633,13 +633,13 @@ def test_scores_labels_and_ages_are_those_of_the_detections():
 
 def test_what_is_not_seen_scores_less_the_less_its_place_is_known():
     state, before = after_two()
-    places_m, scores = [], [before.score[:3]]
+    sds_m, scores = [], [before.score[:3]]
     for _ in range(3):
         state, tracks = step(state, cars([]), 0.1, STAY)
-        places_m.append(np.sqrt(tracks.covariance[:3, 0]))
+        sds_m.append(np.sqrt(tracks.covariance[:3, 0]))
         scores.append(tracks.score[:3])
     mean = before.score[:3]
-    expected = [mean * np.exp(-((sd_m / TrackConfig().unseen_sd_m) ** 2)) for sd_m in places_m]
+    expected = [mean * np.exp(-((sd_m / TrackConfig().unseen_sd_m) ** 2)) for sd_m in sds_m]
     np.testing.assert_allclose(scores[1:], expected, rtol=1e-5)
     assert (np.diff(scores, axis=0) < 0).all()
     # Seen again, it scores as its detections do.

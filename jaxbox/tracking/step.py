@@ -358,6 +358,7 @@ def _answer(
     own_center, own_size, own_yaw = shape.refine_boxes(slots, own)
     shown_yaw = jnp.where(is_seen, own_yaw, yaw)
     mean_score = slots.score_sum / jnp.maximum(slots.hits.astype(jnp.float32), 1)
+    # The variance over a square would be 0 / 0 in free slots, where the setting is the smallest allowed.
     sd_m = jnp.sqrt(slots.covariance[:, 0])
     expected_score = mean_score * jnp.exp(-((sd_m / config.unseen_sd_m) ** 2))
     heading, front_probability = shape.front_of(shown_yaw, slots)
