@@ -3,9 +3,9 @@
 A stage and its reference get the same float32 inputs, so that each answers for its own differences only.
 """
 
-import contextlib
 import dataclasses
 import functools
+import os
 import pathlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ import numpy as np
 
 from jaxbox import reference, synthetic
 from jaxbox.config import DetectorConfig
+from jaxbox.run import compiled
 from jaxbox.stages.state import Evidence
 from jaxbox.xla import backend
 from jaxbox.xla.ragged import PointLists
@@ -34,26 +35,26 @@ MAX_CLUSTERS = 512
 CONFIG = DetectorConfig()
 
 
-@contextlib.contextmanager
-def compiled_quickly():
-    """Compiles without optimisation, which takes two thirds of the time: the answers are right, not fast.
+UNOPTIMISED = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+"""Options with which the compiler takes two thirds of the time: the answers are right, not fast."""
+QUICKLY = UNOPTIMISED | {"xla_cpu_use_fusion_emitters": False}
+"""Options with which it takes a third: rounded otherwise too, also from one program to the next.
 
-    For static settings that one test alone has: JAX keeps the program for whoever has the same.
-    """
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    try:
-        yield
-    finally:
-        jax.config.update("jax_disable_most_optimizations", before)
+Both are for static settings that one test alone has, of which it asks nothing that the compiler decides.
+"""
+UNOPTIMISED_PROCESS = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+"""The environment of a process that compiles all it has with the first of these options."""
+QUICK_PROCESS = UNOPTIMISED_PROCESS | {
+    "XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_cpu_use_fusion_emitters=false".strip()
+}
+"""Likewise, with the second."""
+
+_detect_quickly = jax.jit(compiled._find, compiler_options=QUICKLY)
 
 
-@contextlib.contextmanager
-def building_for(*, accelerator):
-    """As `backend.building_for`, for whole detectors: nobody but the tests runs an accelerator's on a CPU."""
-    quickly = compiled_quickly() if accelerator else contextlib.nullcontext()
-    with quickly, backend.building_for(accelerator=accelerator):
-        yield
+def detect_quickly(cloud, config=None):
+    """As `jaxbox.detect`, compiled with `QUICKLY`."""
+    return _detect_quickly(*compiled._operands(cloud, config, None))
 
 
 class PerForm:

@@ -7,6 +7,8 @@ import shutil
 import subprocess
 import sys
 
+from parity import QUICK_PROCESS
+
 import jaxbox
 from jaxbox import DetectorConfig, Label
 
@@ -31,7 +33,7 @@ def test_another_class_is_one_entry_in_one_file(tmp_path):
     result = subprocess.run(
         [sys.executable, TESTS / "four_classes.py", tmp_path],
         # No other test has this program, and none of its bits is looked at: it need not be fast.
-        env=os.environ | {"PYTHONPATH": str(tmp_path), "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"},
+        env={**os.environ, **QUICK_PROCESS, "PYTHONPATH": str(tmp_path)},
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -178,8 +178,7 @@ def test_the_proposed_capacities_hold_the_sweeps_they_were_proposed_for():
         size < m.max_cells for size, m in zip(proposed(config)[2:], LIGHT.clustering.maps, strict=True)
     )
     for xyz in sweeps:
-        with parity.compiled_quickly():
-            detections = detect(PointCloud.from_numpy(xyz, capacity=2**14), config)
+        detections = parity.detect_quickly(PointCloud.from_numpy(xyz, capacity=2**14), config)
         detections.raise_if_failed()
         assert not Status(int(detections.status)) & ~NO_OVERFLOW
         assert int(detections.counts.obstacles) > 0.5 * config.clustering.max_obstacles / 1.25 - CAPACITY_STEP

@@ -17,6 +17,7 @@ from jaxbox.config.fields import replace_fields
 from jaxbox.geometry.planar import rectangle_iou
 from jaxbox.io import open_sweeps
 from jaxbox.run import compiled
+from jaxbox.xla import backend
 from quality import bad_input
 
 CAPACITY = 2**14
@@ -221,9 +222,9 @@ def assert_shapes_of_singles(batch, size):
     chex.assert_trees_all_equal_shapes_and_dtypes(batch, jax.tree.map(with_axis, found(0)))
 
 
-def batch_anew(clouds):
+def batch_anew(clouds, **options):
     """A batch of clouds by a program of its own: tests that change how it is built leave nothing behind."""
-    find = jax.jit(jax.vmap(compiled._find, (0, None, None)))
+    find = jax.jit(jax.vmap(compiled._find, (0, None, None)), **options)
     return find, compiled._operands(clouds, None, None)
 
 
@@ -231,8 +232,8 @@ def test_a_batch_on_an_accelerator_finds_what_the_singles_do_on_a_cpu_in_their_s
     sweeps = [street(0).xyz, np.zeros((0, 3)), street(1).xyz]
     clouds = stack_clouds([PointCloud.from_numpy(xyz, capacity=CAPACITY) for xyz in sweeps])
     # Run here, where it is slower: all sweeps at once, and each loop in its form for accelerators.
-    with parity.building_for(accelerator=True):
-        find, operands = batch_anew(clouds)
+    with backend.building_for(accelerator=True):
+        find, operands = batch_anew(clouds, compiler_options=parity.UNOPTIMISED)
         many = jax.device_get(find(*operands))
     assert_shapes_of_singles(many, len(sweeps))
     for row, xyz in enumerate(sweeps):

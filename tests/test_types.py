@@ -248,8 +248,7 @@ def rounds():
     """Runs with ever larger capacities, as the errors ask for, until nothing overflows."""
     cloud, config, runs = PointCloud.from_numpy(STREET, capacity=2**14), SMALL, []
     for _ in range(MAX_ROUNDS):
-        with parity.compiled_quickly():
-            detections = detect(cloud, config).on_host()
+        detections = parity.detect_quickly(cloud, config).on_host()
         runs.append((config, detections))
         if not Status(int(detections.status)) & CAPACITY_BITS:
             break
@@ -261,7 +260,7 @@ def rounds():
 
 def test_detections_on_the_host_are_numpy_arrays_of_the_same_numbers(rounds):
     config, detections = rounds[-1]
-    again = detect(PointCloud.from_numpy(STREET, capacity=2**14), config)
+    again = parity.detect_quickly(PointCloud.from_numpy(STREET, capacity=2**14), config)
     for host in (detections, detections.on_host()):
         for ours, theirs in zip(jax.tree.leaves(host), jax.tree.leaves(jax.device_get(again)), strict=True):
             assert isinstance(ours, np.ndarray)
@@ -324,8 +323,9 @@ def test_a_capacity_for_obstacles_that_suffices_changes_nothing(rounds):
 
     def found(max_obstacles):
         clustering = dataclasses.replace(config.clustering, max_obstacles=max_obstacles)
-        with parity.compiled_quickly():
-            return jax.device_get(detect(cloud, dataclasses.replace(config, clustering=clustering)))
+        return jax.device_get(
+            parity.detect_quickly(cloud, dataclasses.replace(config, clustering=clustering))
+        )
 
     # Points are gone through in chunks of 4,096: one capacity is a whole number of them.
     odd, even = found(2500), found(8192)
