@@ -37,9 +37,10 @@ IN_SHORT = {
 """Situations that the suite runs, and how many vehicles are to be found in each."""
 
 
+@pytest.mark.parametrize("place", [(0.0, 0.0), (0.4, -0.3)])
 @pytest.mark.parametrize("situation", SITUATIONS, ids=lambda situation: situation.title)
-def test_vehicles_of_a_situation_stand_apart_and_hold_their_points(situation):
-    for xyz, truth in situation.sweeps(num_azimuths=200):
+def test_vehicles_of_a_situation_stand_apart_and_hold_their_points(situation, place):
+    for xyz, truth in situation.seen_from(*place).sweeps(num_azimuths=200):
         rows = common.box_rows(truth)
         overlap, _ = pairwise_overlaps(rows, rows)
         np.testing.assert_allclose(overlap, np.eye(len(rows)), atol=1e-6)
@@ -69,6 +70,28 @@ def test_the_same_situation_gives_the_same_bits():
     situation = BY_TITLE["beside a hedge: 0.2 m"]
     first, again = (situation.sweeps(num_azimuths=100)[0][0] for _ in range(2))
     assert first.tobytes() == again.tobytes()
+
+
+def test_from_elsewhere_it_is_the_same_scene_in_the_frame_of_the_moved_sensor():
+    situation = BY_TITLE["rows, nose to tail: gaps of 0.3 m"]
+    (xyz, truth), (moved, moved_truth) = (
+        each.sweeps(num_azimuths=400)[0] for each in (situation, situation.seen_from(0.5, -0.25))
+    )
+    np.testing.assert_allclose(moved_truth.center, truth.center - [0.5, -0.25, 0], atol=1e-6)
+    for name in ("size", "yaw", "label"):
+        np.testing.assert_array_equal(getattr(moved_truth, name), getattr(truth, name))
+    # The sensor stays in the middle of its points: the nearest ring of ground is as far away on all sides.
+    for points in (xyz, moved):
+        ground = points[(np.abs(points[:, 2] + 1.73) < 0.1) & (np.hypot(*points[:, :2].T) < 4)]
+        np.testing.assert_allclose(ground[:, :2].mean(axis=0), 0, atol=0.1)
+    assert not np.array_equal(xyz[:100], moved[:100])
+
+
+def test_places_are_the_same_for_the_same_seed_and_the_tables_own_without_draws():
+    assert bench_situations.drawn_places(0, 3) == [(0, 0)]
+    places = bench_situations.drawn_places(50, 3)
+    assert places == bench_situations.drawn_places(50, 3) != bench_situations.drawn_places(50, 4)
+    assert 0.4 < np.abs(places).max() <= bench_situations.ASIDE_M
 
 
 def test_titles_are_unique():

@@ -57,6 +57,20 @@ class Situation:
         """Group and name: what no two situations share."""
         return f"{self.group}: {self.name}"
 
+    def seen_from(self, x: float, y: float) -> "Situation":
+        """The same scenes from elsewhere: every sensor is moved, and the frame of the points with it.
+
+        Args:
+          x: m, how far ahead.
+          y: m, how far to the left.
+
+        Returns:
+          The situation, under the same name.
+        """
+        ahead, left, up = self.shift_m
+        origins = tuple((a + x, b + y, c) for a, b, c in self.origins)
+        return dataclasses.replace(self, origins=origins, shift_m=(ahead - x, left - y, up))
+
     def sweeps(self, *, num_azimuths: int = NUM_AZIMUTHS) -> list[tuple[np.ndarray, TruthBoxes]]:
         """Casts the beams.
 
