@@ -140,13 +140,18 @@ def test_facades_that_end_where_a_truck_would_are_none(seed, find):
     assert (np.linalg.norm(trucks[:, None] - vehicles, axis=2).min(axis=1) < 4).all()
 
 
-@pytest.mark.parametrize("name", ["situations", "situations_before"])
-def test_the_recorded_table_is_that_of_the_code(name):
-    rows = json.loads((RESULTS / f"{name}.json").read_text())["rows"]
+@pytest.mark.parametrize(
+    ("name", "num_places"),
+    [("situations", 1), ("situations_before", 1), ("situations_draws", 8), ("situations_draws_accurate", 8)],
+)
+def test_the_recorded_table_is_that_of_the_code(name, num_places):
+    report = json.loads((RESULTS / f"{name}.json").read_text())
+    rows = report["rows"]
+    assert len(report.get("places", [[0, 0]])) == num_places
     assert [f"{row['group']}: {row['situation']}" for row in rows] == list(BY_TITLE)
     for row in rows:
         situation = BY_TITLE[f"{row['group']}: {row['situation']}"]
-        assert row["vehicles"] <= sum(len(scene.vehicles) for scene in situation.scenes)
+        assert row["vehicles"] <= num_places * sum(len(scene.vehicles) for scene in situation.scenes)
         assert row["vehicles"] == row["found"] + row["loud"] + row["silent"]
         assert not row["loud"] or row["status"]
     assert collections.Counter(row["group"] for row in rows).keys() == {s.group for s in SITUATIONS}

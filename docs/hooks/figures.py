@@ -411,19 +411,20 @@ def mounting() -> str:
 
 
 def situations() -> str:
-    """What is found in hard situations: before the rules that they led to, and now."""
-    now, before = load("situations"), load("situations_before")
-    was = {(row["group"], row["situation"]): row["found"] for row in before["rows"]}
+    """What is found in hard situations: before the rules that they led to, now, and from other places."""
+    now, before, aside = load("situations"), load("situations_before"), load("situations_draws")
+    was, elsewhere = (
+        {f"{row['group']}: {row['situation']}": row for row in of["rows"]} for of in (before, aside)
+    )
     names = ("vehicles", "found", "loud", "silent", "false")
-    rows = [
-        (
-            f"{row['group']}: {row['situation']}",
-            was.get((row["group"], row["situation"]), ""),
-            *(row[n] for n in names),
-        )
-        for row in now["rows"]
-    ]
-    return table(["situation", "found before", *names], rows) + made_with(now)
+    rows = []
+    for row in now["rows"]:
+        title = f"{row['group']}: {row['situation']}"
+        drawn = elsewhere[title]
+        found_aside = f"{drawn['found']} of {drawn['vehicles']}"
+        rows.append((title, was.get(title, {"found": ""})["found"], *(row[n] for n in names), found_aside))
+    header = ["situation", "found before", *names, f"found from {len(aside['places'])} places aside"]
+    return table(header, rows) + made_with(now)
 
 
 def status() -> str:
