@@ -2,7 +2,6 @@
 
 import collections
 import dataclasses
-import functools
 import re
 
 import chex
@@ -103,18 +102,16 @@ def test_with_64_bits_enabled_the_program_computes_in_32_and_promotes_no_type_an
     preset, accelerator
 ):
     strict = jax.numpy_dtype_promotion("strict"), jax.numpy_rank_promotion("raise")
-    config = DetectorConfig.presets()[preset]
-    find, given = functools.partial(detect, config=config), street()
-    if accelerator:
-        # A CPU goes through a batch with the program of one sweep in a loop.
-        find, given = jax.vmap(find), stack_clouds([given, given])
+    config, clouds = DetectorConfig.presets()[preset], stack_clouds([street(), street()])
     with backend.building_for(accelerator=accelerator), enable_x64(True), strict[0], strict[1]:
-        program, answer = jax.make_jaxpr(find, return_shape=True)(given)
-    assert answer.valid.shape[-1:] == (config.vehicles.max_detections,)
-    avals = [aval for aval in avals_in(program.jaxpr) if hasattr(aval, "dtype")]
-    assert len(avals) > 1000
-    # Python's numbers, and in JAX 0.6 the place of an entry that is known, are of 64 bits.
-    assert not [aval for aval in avals if str(aval.dtype) in WIDE and aval.size > 2]
+        many = jax.make_jaxpr(jax.vmap(lambda cloud: detect(cloud, config)))(clouds)
+        single, answer = jax.make_jaxpr(lambda cloud: detect(cloud, config), return_shape=True)(street())
+    assert answer.valid.shape == (config.vehicles.max_detections,)
+    for program in (single, many):
+        avals = [aval for aval in avals_in(program.jaxpr) if hasattr(aval, "dtype")]
+        assert len(avals) > 1000
+        # Python's numbers, and in JAX 0.6 the place of an entry that is known, are of 64 bits.
+        assert not [aval for aval in avals if str(aval.dtype) in WIDE and aval.size > 2]
 
 
 def assert_same_boxes(many, clouds):

@@ -45,8 +45,8 @@ def detect_in_form(case, preset, accelerator):
     cloud = jaxbox.PointCloud.from_numpy(case.xyz, capacity=parity.CAPACITY)
     with backend.building_for(accelerator=accelerator):
         # Nobody but the tests runs an accelerator's program on a CPU.
-        detect = parity.detect_quickly if accelerator else jaxbox.detect
-        return parity.on_host(detect(cloud, PRESETS[preset]))
+        find = parity.detect_quickly if accelerator else jaxbox.detect
+        return parity.on_host(find(cloud, PRESETS[preset]))
 
 
 def both(cases, preset, use_plane):

@@ -420,9 +420,8 @@ def situations() -> str:
     rows = []
     for row in now["rows"]:
         title = f"{row['group']}: {row['situation']}"
-        drawn = elsewhere[title]
-        found_aside = f"{drawn['found']} of {drawn['vehicles']}"
-        rows.append((title, was.get(title, {"found": ""})["found"], *(row[n] for n in names), found_aside))
+        found_aside = "{found} of {vehicles}".format_map(elsewhere[title])
+        rows.append((title, was[title]["found"], *(row[n] for n in names), found_aside))
     header = ["situation", "found before", *names, f"found from {len(aside['places'])} places aside"]
     return table(header, rows) + made_with(now)
 
