@@ -63,8 +63,11 @@ hypothesis.settings.load_profile("ci")
 def pytest_configure(config: pytest.Config) -> None:
     """Keeps compiled functions in pytest's cache: the notebook's kernel and the next run share them.
 
+    They are compiled with `parity.SMALL_CODE`, here and in the processes that tests start.
+
     `pytest --cache-clear` starts from nothing.
     """
+    os.environ["XLA_FLAGS"] = f"{parity.SMALL_CODE} {os.environ.get('XLA_FLAGS', '')}".strip()
     folder = os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(config.cache.mkdir("jax")))
     jax.config.update("jax_compilation_cache_dir", folder)
     # The user's own cache is left alone, also by the processes that tests start.

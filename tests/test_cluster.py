@@ -42,7 +42,7 @@ from jaxbox.cluster.track_worker import TrackTask, TrackWorker
 from jaxbox.cluster.worker import Attempt, Partition
 from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.io.parquet import PARQUET_COLUMNS
-from jaxbox.run.cache import CacheFolders
+from jaxbox.run.cache import CACHE_VARIABLE, CacheFolders
 from jaxbox.run.pose_providers import estimated_source
 from jaxbox.run.versions import versions
 from jaxbox.tracking.poses import PoseSource
@@ -61,6 +61,16 @@ def _own_environment(monkeypatch):
     # What the workers set for themselves, and that is put back here.
     monkeypatch.setenv("NPROC", os.environ.get("NPROC", "1"))
     monkeypatch.setenv("RAY_USAGE_STATS_ENABLED", "0")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _kept_programs(tmp_path_factory):
+    """Has the workers take the programs that this process has traced: each would trace and load its own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(CACHE_VARIABLE, str(tmp_path_factory.mktemp("cache")))
+        # As here, or they are other programs.
+        patch.setenv("JAX_NUMPY_DTYPE_PROMOTION", "strict")
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -120,6 +120,7 @@ class DetectWorker(PartitionWorker[DetectTask, PartitionReport]):
             return 0.0
         start = time.perf_counter()
         empty = PointCloud.from_numpy(np.zeros((0, 3), np.float32), capacity=capacity)
-        jax.block_until_ready(detect_batch([empty], self._task.config))
+        # For each device that batches go to.
+        jax.block_until_ready(detect_batch([empty] * jax.local_device_count(), self._task.config))
         self._compiled.add(capacity)
         return time.perf_counter() - start
