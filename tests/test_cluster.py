@@ -30,6 +30,7 @@ from jaxbox.cluster import (
     DriveReport,
     PartitionReport,
     detect_dataset,
+    detect_worker,
     sources,
     track_dataset,
     worker,
@@ -42,6 +43,7 @@ from jaxbox.cluster.track_worker import TrackTask, TrackWorker
 from jaxbox.cluster.worker import Attempt, Partition
 from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.io.parquet import PARQUET_COLUMNS
+from jaxbox.run import batching
 from jaxbox.run.cache import CACHE_VARIABLE, CacheFolders
 from jaxbox.run.pose_providers import estimated_source
 from jaxbox.run.versions import versions
@@ -262,6 +264,24 @@ def test_a_worker_writes_the_rows_of_the_local_run_and_its_report_is_in_the_file
     assert json.loads(metadata[b"jaxbox.sweeps"]) == [name for name in NAMES if name != BROKEN]
     assert PartitionReport.from_json(metadata[worker.REPORT_KEY.encode()]) == report
     assert [path.name for path in tmp_path.iterdir()] == ["part-000000.parquet"]
+
+
+@pytest.mark.usefixtures("_all_devices")
+def test_a_worker_prepares_every_device_that_its_batches_go_to(archive, local, tmp_path, monkeypatch):
+    prepared, used = [], []
+
+    def detect_batch(clouds, config):
+        answers = batching.detect_batch(clouds, config)
+        devices = {device for answer in answers for device in answer.score.devices()}
+        (used if any(cloud.num_points for cloud in clouds) else prepared).append(devices)
+        return answers
+
+    monkeypatch.setattr(detect_worker, "detect_batch", detect_batch)
+    DetectWorker(task_for(tmp_path)).work(partition_of(archive))
+    assert prepared == [set(jax.local_devices())]
+    assert set.union(*used) == prepared[0]
+    assert len(prepared[0]) > 1
+    assert rows_of(tmp_path).equals(local)
 
 
 def test_after_a_death_each_sweep_goes_alone_and_one_that_kills_again_is_given_up(archive, local, tmp_path):
