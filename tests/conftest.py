@@ -67,7 +67,10 @@ def pytest_configure(config: pytest.Config) -> None:
 
     `pytest --cache-clear` starts from nothing.
     """
-    os.environ["XLA_FLAGS"] = f"{parity.SMALL_CODE} {os.environ.get('XLA_FLAGS', '')}".strip()
+    flags = os.environ.get("XLA_FLAGS", "")
+    # Once only, though a worker of `-n` has its parent's: JAX looks for what is compiled by all flags given.
+    if parity.SMALL_CODE not in flags:
+        os.environ["XLA_FLAGS"] = f"{parity.SMALL_CODE} {flags}".strip()
     folder = os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(config.cache.mkdir("jax")))
     jax.config.update("jax_compilation_cache_dir", folder)
     # The user's own cache is left alone, also by the processes that tests start.

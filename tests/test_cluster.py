@@ -43,7 +43,7 @@ from jaxbox.cluster.track_worker import TrackTask, TrackWorker
 from jaxbox.cluster.worker import Attempt, Partition
 from jaxbox.config import DetectorConfig, TrackConfig
 from jaxbox.io.parquet import PARQUET_COLUMNS
-from jaxbox.run import batching
+from jaxbox.run import batching, compiled
 from jaxbox.run.cache import CACHE_VARIABLE, CacheFolders
 from jaxbox.run.pose_providers import estimated_source
 from jaxbox.run.versions import versions
@@ -72,6 +72,8 @@ def _kept_programs(tmp_path_factory):
         patch.setenv(CACHE_VARIABLE, str(tmp_path_factory.mktemp("cache")))
         # As here, or they are other programs.
         patch.setenv("JAX_NUMPY_DTYPE_PROMOTION", "strict")
+        # Afterwards the tests of other modules keep none again.
+        patch.setattr(compiled, "_programs", None)
         yield
 
 
