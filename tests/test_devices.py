@@ -1,6 +1,7 @@
 """One decision about what a program is built for, and what the program for accelerators may hold."""
 
 import functools
+import math
 import re
 
 import jax
@@ -18,6 +19,13 @@ MAX_LOOPS = 3
 """Loops until nothing changes: hooking of components, counting of neighbours, suppression."""
 MERGE_LOOPS = 1
 """Suppression once more, where several readings are merged."""
+REDUCTION = re.compile(
+    r"stablehlo\.reduce\(%\w+ init: %\w+\)(?: applies \S+)?"
+    r" across dimensions = \[(\d+)\] : \(tensor<([\dx]+)x\w+>"
+)
+"""A reduction of one array along one axis: the axis, and the array's shape."""
+MAX_REDUCED, MANY = 256, 2**20
+"""Numbers that one result of many may be made of."""
 
 
 @functools.cache
@@ -34,6 +42,19 @@ def test_the_program_for_accelerators_hardly_waits_for_its_host(preset):
     several = DetectorConfig.presets()[preset].vehicles.num_readings > 1
     assert text.count("stablehlo.while") <= MAX_LOOPS + several * MERGE_LOOPS
     assert text.count("stablehlo.case") == text.count("stablehlo.if") == 0
+
+
+@pytest.mark.codegen
+@pytest.mark.parametrize("preset", sorted(DetectorConfig.presets()))
+def test_triton_is_given_no_reduction_of_all_pairs_of_rows(preset):
+    # In a batch its code for them is compiled for minutes, see `barriers.reduce_pairs`.
+    found = [
+        (shape, int(axis))
+        for axis, dimensions in REDUCTION.findall(text_for("cuda", preset))
+        if math.prod(shape := [int(size) for size in dimensions.split("x")]) >= MANY
+    ]
+    assert found
+    assert not [(shape, axis) for shape, axis in found if shape[axis] > MAX_REDUCED]
 
 
 @pytest.mark.codegen

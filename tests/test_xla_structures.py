@@ -12,6 +12,7 @@ import pytest
 from scipy import ndimage
 
 from jaxbox.xla import (
+    barriers,
     bits,
     chunks,
     components,
@@ -477,6 +478,15 @@ def test_rows_that_a_mask_picks_are_joined_with_each_other_alone(share):
     each = np.uint32(rows[:, None] ^ (np.uint32(1) << rows[None, :]))
     expected = np.where(mask, np.bitwise_or.reduce(each[:, mask], axis=1, initial=0), 0)
     np.testing.assert_array_equal(join(mask), expected)
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("combine", [np.add, np.bitwise_or])
+def test_pairs_are_reduced_along_either_axis(combine, axis):
+    words = np.random.default_rng(axis).integers(0, 2**32, (7, 5), np.uint32)
+    found = barriers.reduce_pairs(jnp.asarray(words), getattr(jax.lax, combine.__name__), axis)
+    np.testing.assert_array_equal(found, combine.reduce(words, axis=axis, dtype=np.uint32))
 
 
 def test_all_pairs_are_each_row_with_each_other_one():

@@ -113,16 +113,19 @@ def find_lines(boxes: jax.Array, early: jax.Array, may_be: jax.Array, config: Ve
     """
 
     def place_of(own: jax.Array, other: jax.Array) -> jax.Array:
-        (x, y, length, _, yaw), (other_x, other_y, other_length, _, other_yaw) = own, other
-        dx, dy, cos, sin = other_x - x, other_y - y, jnp.cos(yaw), jnp.sin(yaw)
+        (x, y, length, cos, sin), (other_x, other_y, other_length, other_cos, other_sin) = own, other
+        dx, dy = other_x - x, other_y - y
         ahead, aside = dx * cos + dy * sin, jnp.abs(dy * cos - dx * sin)
         lengths = jnp.abs(ahead) / ((length + other_length) / 2)
-        aligned = (aside < MAX_ASIDE_M) & (jnp.abs(jnp.sin(other_yaw - yaw)) < MAX_LINE_SINE)
+        aligned = (aside < MAX_ASIDE_M) & (jnp.abs(other_sin * cos - other_cos * sin) < MAX_LINE_SINE)
         first = (lengths > NEAREST_LENGTHS) & (lengths < config.line_lengths)
         second = (lengths > 2 * NEAREST_LENGTHS) & (lengths < 2 * config.line_lengths)
         return _place(aligned & first, aligned & second, ahead > 0)
 
-    return _in_threes(boxes, may_be & (early > MIN_EARLY), place_of)
+    # By products, as for rows: the sines are of P boxes, not of P^2 pairs.
+    x, y, length, _, yaw = boxes.T
+    rows = jnp.stack([x, y, length, jnp.cos(yaw), jnp.sin(yaw)], axis=1)
+    return _in_threes(rows, may_be & (early > MIN_EARLY), place_of)
 
 
 def _place(first: jax.Array, second: jax.Array, on_one_side: jax.Array) -> jax.Array:

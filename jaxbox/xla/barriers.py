@@ -114,6 +114,33 @@ def single_kernel(function: Callable[..., Any], *operands: Any) -> Any:
     return jax.lax.while_loop(lambda state: state[0], turn, (once, _zeros_of(function, *operands)))[1]
 
 
+def reduce_pairs(values: jax.Array, combine: Callable[[Any, Any], Any], axis: int) -> jax.Array:
+    """Reduces what is worked out of all pairs of rows, on a GPU without Triton.
+
+    Law: ``jax.lax.reduce(values, 0, combine, (axis,))``.
+
+    XLA for GPUs tries Triton for every reduction of one array. What that makes of all pairs of the rows of a
+    batch is straight-line code of any length: jax 0.11.2 compiled it for minutes. For a reduction of two
+    arrays, here of zeros besides, it has only the kernels that it writes itself.
+
+    Args:
+      values: numbers or words.
+      combine: of two of them, such as `jax.lax.add`, which 0 leaves as they are.
+      axis: static.
+
+    Returns:
+      The values without the axis.
+    """
+    zero = jnp.zeros((), values.dtype)
+    if not on_accelerator():
+        return jax.lax.reduce(values, zero, combine, (axis,))
+
+    def both(one: Any, other: Any) -> Any:
+        return combine(one[0], other[0]), combine(one[1], other[1])
+
+    return combine(*jax.lax.reduce((values, jnp.zeros_like(values)), (zero, zero), both, (axis,)))
+
+
 def _zeros_of(function: Callable[..., Any], *operands: Any) -> Any:
     """Zeros in the shapes of a function's result."""
     return jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), jax.eval_shape(function, *operands))

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
+from jaxbox.xla.barriers import reduce_pairs
 from jaxbox.xla.indexing import scatter, take
 from jaxbox.xla.loops import for_chunks, whole_chunks
 from jaxbox.xla.rows import compact
@@ -71,4 +72,4 @@ def _join(relation: Relation, first: jax.Array, second: jax.Array, counts: jax.A
     # Reductions along the first axis vectorise on a CPU.
     each = all_pairs(lambda other, own: relation(own, other), second, first)
     each = jnp.where(counts.T, each, jnp.uint32(0))
-    return jax.lax.reduce(each, jnp.uint32(0), jax.lax.bitwise_or, (0,))
+    return reduce_pairs(each, jax.lax.bitwise_or, axis=0)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 
 from jaxbox.xla import chunks
 from jaxbox.xla.backend import on_accelerator
-from jaxbox.xla.barriers import materialize, single_kernel
+from jaxbox.xla.barriers import materialize, reduce_pairs, single_kernel
 from jaxbox.xla.bits import WORD_BITS
 from jaxbox.xla.indexing import lookup, scatter
 from jaxbox.xla.loops import for_chunks
@@ -188,7 +188,7 @@ def _num_better(score: jax.Array) -> jax.Array:
     row = jnp.arange(score.shape[0], dtype=jnp.int32)
     comes_first = (score[None] == score[:, None]) & (row[None] < row[:, None])
     better = (score[None] > score[:, None]) | comes_first
-    return jnp.sum(better, axis=1, dtype=jnp.int32)
+    return reduce_pairs(better.astype(jnp.int32), jax.lax.add, axis=1)
 
 
 def best_first(score: jax.Array, num: jax.Array) -> jax.Array:
