@@ -42,14 +42,17 @@ An answer takes 1.8 times as long, which is little in tests.
 
 UNOPTIMISED = {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
 """Options with which the compiler takes two thirds of the time: the answers are right, not fast."""
-QUICKLY = UNOPTIMISED | {"xla_cpu_use_fusion_emitters": False}
+# A choice that there is up to jax 0.10.
+_EMITTERS = {"xla_cpu_use_fusion_emitters": False} if jax.__version_info__ < (0, 11) else {}
+QUICKLY = UNOPTIMISED | _EMITTERS
 """Options with which it takes a third: rounded otherwise too, also from one program to the next.
 
 Both are for static settings that one test alone has, of which it asks nothing that the compiler decides.
 """
 UNOPTIMISED_PROCESS = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
 """The environment of a process that compiles all it has with the first of these options."""
-QUICK_PROCESS = UNOPTIMISED_PROCESS | {"XLA_FLAGS": f"{SMALL_CODE} --xla_cpu_use_fusion_emitters=false"}
+_NO_EMITTERS = "".join(f" --{option}=false" for option in _EMITTERS)
+QUICK_PROCESS = UNOPTIMISED_PROCESS | {"XLA_FLAGS": SMALL_CODE + _NO_EMITTERS}
 """Likewise, with the second."""
 
 _detect_quickly = jax.jit(compiled._find, compiler_options=QUICKLY)

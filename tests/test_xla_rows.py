@@ -31,6 +31,18 @@ def test_prefix_sum_and_prefix_max_are_those_of_numpy_on_every_platform(size):
     np.testing.assert_array_equal(greatest, np.maximum.accumulate(abs(values)))
 
 
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("dtype", [np.int32, np.uint32])
+def test_running_sums_are_those_of_numpy_along_either_axis(dtype, size):
+    values = np.random.default_rng(size).integers(0, 9, (size, 3)).astype(dtype)
+    for axis in (0, 1):
+        total = rows.running_sum(jnp.asarray(values), axis)
+        assert total.dtype == dtype
+        np.testing.assert_array_equal(total, np.cumsum(values, axis=axis))
+    batch = jax.vmap(functools.partial(rows.running_sum, axis=0))(jnp.asarray(values))
+    np.testing.assert_array_equal(batch, np.cumsum(values, axis=1))
+
+
 @pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("size", SIZES)
 def test_count_true_and_maximum_are_those_of_numpy_on_every_platform(size):

@@ -11,7 +11,7 @@ from jaxbox.xla.backend import on_accelerator
 from jaxbox.xla.barriers import materialize, single_kernel
 from jaxbox.xla.bits import WORD_BITS, count_bits, pack_bits
 from jaxbox.xla.indexing import gather, lookup, scatter, take
-from jaxbox.xla.rows import prefix_sum
+from jaxbox.xla.rows import prefix_sum, running_sum
 
 STRIP_WORDS = 32
 """R, words of a strip of consecutive cells. The strips lie side by side in tables (R, S), so that sums along
@@ -189,7 +189,7 @@ def _prefix(count: jax.Array) -> tuple[jax.Array, jax.Array]:
     of_strip = jnp.sum(count, axis=0, dtype=jnp.int32)
     up_to = prefix_sum(of_strip)
     if on_accelerator():
-        return jnp.cumsum(count, axis=0) - count + (up_to - of_strip)[None], up_to[-1]
+        return running_sum(count, axis=0) - count + (up_to - of_strip)[None], up_to[-1]
     _, before = jax.lax.scan(lambda before, row: (before + row, before), up_to - of_strip, count)
     return before, up_to[-1]
 
