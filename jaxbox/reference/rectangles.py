@@ -12,6 +12,9 @@ from jaxbox.reference.state import Rectangle, Rotations
 PREFERENCE_GAIN = 5.0
 """How often the scene's direction counts for the second candidate of a cluster."""
 
+SAME_DISTANCE_M = 1e-4
+"""Distances to two edges that differ by less are the same: a corner's point is on both, as it is rounded."""
+
 
 def fit_rectangles(outlines: Sequence[np.ndarray], config: BoxConfig) -> list[Rotations]:
     """Rectangles of all clusters at all rotations.
@@ -135,7 +138,8 @@ def try_rotations(xy: np.ndarray, config: BoxConfig) -> tuple[np.ndarray, np.nda
     else:
         to_u, to_v = np.minimum(u - u0, u1 - u), np.minimum(v - v0, v1 - v)
     if criterion == "variance":
-        return -_variance(to_u, to_u < to_v) - _variance(to_v, to_v <= to_u), extents
+        nearer_u = to_u < to_v - SAME_DISTANCE_M
+        return -_variance(to_u, nearer_u) - _variance(to_v, ~nearer_u), extents
     if criterion not in ("closeness", "visible_closeness"):
         raise ValueError(
             f"criterion is {criterion!r}; it must be area, variance, closeness or visible_closeness."

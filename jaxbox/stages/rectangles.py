@@ -28,6 +28,9 @@ so many points: to weigh it takes time."""
 FAR_M = 1e12
 """Farther away than any point."""
 
+SAME_DISTANCE_M = 1e-4
+"""Distances to two edges that differ by less are the same: a corner's point is on both, as it is rounded."""
+
 
 def fit_rectangles(outlines: Outlines, num_clusters: jax.Array, config: BoxConfig) -> Rotations:
     """Rectangles of all clusters at all rotations.
@@ -259,7 +262,7 @@ def _variance(
     def update(state: tuple[jax.Array, ...], x: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
         du, dv = _to_edge(_along(x, y, cos, sin), u0, u1), _to_edge(_along(x, y, minus_sin, cos), v0, v1)
         is_point = (jnp.abs(x) < FAR_M / 2)[None]
-        along_u = is_point & (du < dv)
+        along_u = is_point & (du < dv - SAME_DISTANCE_M)
         along_v = is_point & ~along_u
         nu, su, ssu, nv, sv, ssv = state
         du, dv = jnp.where(along_u, du, 0), jnp.where(along_v, dv, 0)
