@@ -25,7 +25,7 @@ REDUCTION = re.compile(
 )
 """A reduction of one array along one axis: the axis, and the array's shape."""
 MAX_REDUCED, MANY = 256, 2**20
-"""Numbers that one result of many may be made of."""
+"""Numbers that one result may be made of where an array has so many."""
 
 
 @functools.cache
