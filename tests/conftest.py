@@ -33,8 +33,8 @@ FAST = {
     "test_synthetic.py", "test_tracking_poses.py", "test_tuning.py", "test_types.py", "test_viz.py",
     "test_viz_judged.py", "test_viz_tracks.py", "test_xla_laws.py",
 }  # fmt: skip
-"""Files whose tests make up ``pytest -m fast``, but for the tests in `SLOW`."""
-SLOW = {
+"""Files whose tests make up ``pytest -m fast``, but for the tests in `COMPILING`."""
+COMPILING = {
     "test_another_class_is_one_entry_in_one_file",
     "test_files_made_to_fill_the_memory_are_refused",
     "test_files_that_claim_or_unpack_to_too_much_are_refused_within_time_and_memory",
@@ -93,7 +93,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         # Doctests have no fixtures.
         names = {getattr(item, "originalname", item.name), *getattr(item, "fixturenames", ())}
-        if item.path.name in FAST and not names & SLOW:
+        if item.path.name in FAST and not names & COMPILING:
             item.add_marker(pytest.mark.fast)
 
 

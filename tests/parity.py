@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from jaxbox import reference, synthetic
 from jaxbox.config import DetectorConfig
@@ -61,6 +62,12 @@ _detect_quickly = jax.jit(compiled._find, compiler_options=QUICKLY)
 def detect_quickly(cloud, config=None):
     """As `jaxbox.detect`, compiled with `QUICKLY`."""
     return _detect_quickly(*compiled._operands(cloud, config, None))
+
+
+def slow_but_first(values):
+    """Parameters of a test, of which all but the first are slow, such as presets."""
+    first, *others = (value if isinstance(value, tuple) else (value,) for value in values)
+    return [pytest.param(*first), *(pytest.param(*value, marks=pytest.mark.slow) for value in others)]
 
 
 class PerForm:

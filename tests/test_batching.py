@@ -79,6 +79,7 @@ def test_devices_take_turns_and_each_gets_the_cloud_and_the_key(monkeypatch):
         np.testing.assert_array_equal(sent.xyz1, clouds[number].xyz1)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_all_devices")
 def test_each_device_has_the_bits_of_the_singles():
     for seed, detections in zip(SEEDS, detect_batch([cloud(seed) for seed in SEEDS], PAPER), strict=True):
@@ -164,6 +165,7 @@ def test_a_stream_refuses_what_cannot_work_before_it_starts():
         jaxbox.stream([], DetectorConfig(evidence=EvidenceConfig(enabled=False)))
 
 
+@pytest.mark.slow
 def test_processes_keep_the_order_and_the_bits_and_survive_a_deadly_sweep():
     failures = {1: "deadly", 3: "unreadable"}
     results = list(

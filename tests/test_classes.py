@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 
+import pytest
 from parity import QUICK_PROCESS
 
 import jaxbox
@@ -28,6 +29,7 @@ def copy_with_a_bus(folder):
     table.write_text(text + truck.replace("TRUCK", "BUS").replace("length_m=8.5", "length_m=12.0"))
 
 
+@pytest.mark.slow
 def test_another_class_is_one_entry_in_one_file(tmp_path):
     copy_with_a_bus(tmp_path)
     result = subprocess.run(

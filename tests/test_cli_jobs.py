@@ -54,6 +54,7 @@ def account_of(output):
     return json.loads((output / "run.json").read_text())
 
 
+@pytest.mark.slow
 def test_two_jobs_write_the_files_of_one_though_a_worker_is_killed(street, alone, tmp_path, monkeypatch):
     call, killed = processes._Process.call, []
 

@@ -268,6 +268,7 @@ def test_a_worker_writes_the_rows_of_the_local_run_and_its_report_is_in_the_file
     assert [path.name for path in tmp_path.iterdir()] == ["part-000000.parquet"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("_all_devices")
 def test_a_worker_prepares_every_device_that_its_batches_go_to(archive, local, tmp_path, monkeypatch):
     prepared, used = [], []
@@ -362,6 +363,7 @@ def kill_worker_of(output, partition):
     os.kill(json.loads((output / f".{partition}.attempt.json").read_text())["pid"], signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_an_archive_on_ray_interrupted_killed_and_resumed_has_the_boxes_of_one_process(
     ray, served, local, tmp_path, monkeypatch
 ):
@@ -654,6 +656,7 @@ def test_a_drive_that_kills_its_workers_is_given_up_and_one_without_points_has_n
     assert list((tmp_path / "out").glob("*.parquet")) == []
 
 
+@pytest.mark.slow
 def test_drives_on_ray_broken_mended_killed_and_resumed_have_the_tracks_of_one_process(ray, drives, tmp_path):
     root, output = tmp_path / "drives", tmp_path / "out"
     shutil.copytree(drives, root)

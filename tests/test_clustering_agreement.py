@@ -42,6 +42,7 @@ def test_a_cluster_is_the_same_only_where_both_share_nine_tenths_of_it(bench):
     assert bench.share_in_same_clusters(first, np.full(200, -1)) == 0
 
 
+@pytest.mark.slow
 def test_grid_components_of_real_sweeps_agree_with_euclidean_clusters(bench, data_root):
     config = DetectorConfig.paper()
     for case in parity.real_cases(data_root)[2:4]:

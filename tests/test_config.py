@@ -170,6 +170,7 @@ def test_bad_arguments_of_proposals_are_refused_saying_which():
             propose_capacities([np.zeros((5, 3))], margin=margin)
 
 
+@pytest.mark.slow
 def test_the_proposed_capacities_hold_the_sweeps_they_were_proposed_for():
     sweeps = [make_sweep(seed, num_beams=32, num_azimuths=520).xyz for seed in range(3)]
     config = propose_capacities(sweeps, base=LIGHT)
@@ -184,6 +185,7 @@ def test_the_proposed_capacities_hold_the_sweeps_they_were_proposed_for():
         assert int(detections.counts.obstacles) > 0.5 * config.clustering.max_obstacles / 1.25 - CAPACITY_STEP
 
 
+@pytest.mark.slow
 def test_the_rough_look_at_real_sweeps_proposes_enough(data_root):
     frames = open_sweeps(data_root / "kitti_object" / "training")[::4]
     default = DetectorConfig()

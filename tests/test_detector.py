@@ -159,7 +159,9 @@ def test_thresholds_go_in_as_one_array_that_native_loops_cut_up(preset):
 
 
 @pytest.mark.codegen
-@pytest.mark.parametrize(("preset", "most"), [("default", 41), ("fast", 41), ("paper", 22)])
+@pytest.mark.parametrize(
+    ("preset", "most"), parity.slow_but_first([("default", 41), ("fast", 41), ("paper", 22)])
+)
 def test_a_cpu_runs_no_more_loops_operation_by_operation(preset, most):
     # A loop over rows whose step grows is native code no longer, and says so by nothing but its time.
     cloud = PointCloud.from_numpy(np.zeros((1, 3), np.float32), capacity=2**17)
@@ -228,6 +230,7 @@ def batch_anew(clouds, **options):
     return find, compiled._operands(clouds, None, None)
 
 
+@pytest.mark.slow
 def test_a_batch_on_an_accelerator_finds_what_the_singles_do_on_a_cpu_in_their_shapes():
     sweeps = [street(0).xyz, np.zeros((0, 3)), street(1).xyz]
     clouds = stack_clouds([PointCloud.from_numpy(xyz, capacity=CAPACITY) for xyz in sweeps])
@@ -270,6 +273,7 @@ def test_only_an_accelerator_takes_a_batch_at_once_and_not_where_scatters_are_or
     np.testing.assert_array_equal(found, a - b if together else a + b)
 
 
+@pytest.mark.slow
 def test_assignments_beyond_their_capacity_are_counted_and_the_largest_clusters_are_kept():
     full, few = found(0), 24
     completion = dataclasses.replace(DetectorConfig().completion, max_assignments=few)

@@ -16,6 +16,7 @@ from quality import determinism, soak
 BOX = np.array([10.0, 2, -1, 4, 1.8, 1.5, 0.1, 0.5])
 
 
+@pytest.mark.slow
 def test_a_hundred_repeats_have_the_same_bits():
     sweeps = [determinism.Given(f"street {seed}", street(seed).xyz) for seed in range(2)]
     assert determinism.repeat(sweeps, DetectorConfig(), 100) == 0
@@ -35,6 +36,7 @@ def test_a_digest_tells_one_bit_a_shape_and_a_type():
     assert len({digest(answer), *map(digest, others)}) == 4
 
 
+@pytest.mark.slow
 def test_another_process_has_the_same_bits_and_so_have_the_compilers_own_options():
     options = determinism.common.parser("", preset=False, quick="small").parse_args(["--quick"])
     expected = [determinism.digest(found(seed)) for seed in range(determinism.NUM_SWEEPS)]

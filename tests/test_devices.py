@@ -8,6 +8,7 @@ import jax
 import jax.export
 import jax.numpy as jnp
 import numpy as np
+import parity
 import pytest
 
 from jaxbox import DetectorConfig, PointCloud, detect, synthetic
@@ -35,7 +36,7 @@ def text_for(platform, preset="default"):
 
 
 @pytest.mark.codegen
-@pytest.mark.parametrize("preset", sorted(DetectorConfig.presets()))
+@pytest.mark.parametrize("preset", parity.slow_but_first(DetectorConfig.presets()))
 def test_the_program_for_accelerators_hardly_waits_for_its_host(preset):
     # The host of a GPU waits at each turn of a loop, and at each conditional.
     text = text_for("cuda", preset)
@@ -45,7 +46,7 @@ def test_the_program_for_accelerators_hardly_waits_for_its_host(preset):
 
 
 @pytest.mark.codegen
-@pytest.mark.parametrize("preset", sorted(DetectorConfig.presets()))
+@pytest.mark.parametrize("preset", parity.slow_but_first(DetectorConfig.presets()))
 def test_triton_is_given_no_reduction_of_all_pairs_of_rows(preset):
     # In a batch its code for them is compiled for minutes, see `barriers.reduce_pairs`.
     found = [

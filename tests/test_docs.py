@@ -102,6 +102,7 @@ def test_the_pipeline_strip_is_of_this_detector(tmp_path):
     assert differing < 0.001, "python examples/pipeline_strip.py docs/pipeline.png"
 
 
+@pytest.mark.slow
 def test_the_pictures_of_the_tutorial_are_of_these_steps(tmp_path):
     load(PROJECT / "examples" / "single_steps.py").main([str(tmp_path)])
     names = re.findall(r"\((step_\w+\.png)\)", (PROJECT / "docs" / "tutorial.md").read_text())

@@ -35,6 +35,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_an_exported_detector_runs_without_jaxbox_and_gives_the_same_bits(folder):
     xyz = street(0).xyz
     np.save(folder / "xyz1.npy", PointCloud.from_numpy(xyz, capacity=CAPACITY).xyz1)

@@ -51,6 +51,7 @@ def faults(monkeypatch):
 # --- killed -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_a_run_ends_as_if_nothing_had_happened(tmp_path, faults, monkeypatch):
     # Processes of their own, which share the compiled detector of these tests.
     monkeypatch.setenv(cache.CACHE_VARIABLE, str(tmp_path / "cache"))

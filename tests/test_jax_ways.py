@@ -20,7 +20,6 @@ from quality import bad_input
 
 CAPACITY = bad_input.CAPACITY
 """For which other tests compile the presets too, so that a run compiles them once."""
-PRESETS = sorted(DetectorConfig.presets())
 WIDE = {"int64", "uint64", "float64", "complex128"}
 SWEEPS = jax.sharding.PartitionSpec("sweeps")
 
@@ -62,6 +61,7 @@ def widened(cloud, config):
     return cloud, jax.tree.map(jnp.float64, config)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("preset", "wide"), [("default", False), ("paper", True)])
 def test_with_64_bits_enabled_the_bits_are_those_without(preset, wide):
     config, cloud = DetectorConfig.presets()[preset], street()
@@ -88,6 +88,7 @@ def operations_of(lowered):
     return collections.Counter(re.sub(r"%\w+", "%", line).strip() for line in lines)
 
 
+@pytest.mark.slow
 def test_with_64_bits_enabled_a_batch_has_the_bits_of_the_singles():
     clouds = [street(seed) for seed in (0, 1)]
     with enable_x64(True):
@@ -97,7 +98,7 @@ def test_with_64_bits_enabled_a_batch_has_the_bits_of_the_singles():
 
 
 @pytest.mark.parametrize("accelerator", [False, True])
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", parity.slow_but_first(DetectorConfig.presets()))
 def test_with_64_bits_enabled_the_program_computes_in_32_and_promotes_no_type_and_no_rank(
     preset, accelerator
 ):
@@ -132,6 +133,7 @@ def spread(clouds, axis_type):
     return jax.device_put(stack_clouds(clouds), sharding), mesh
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(jax.__version_info__ < (0, 10), reason="explicit meshes of older JAX know no scatters")
 def test_a_batch_over_an_explicit_mesh_is_found_where_it_is():
     clouds = [street(seed) for seed in range(4)]
@@ -184,6 +186,7 @@ def test_a_gradient_of_what_follows_is_there():
     assert jax.grad(weighted)(1.0) == weighted(1.0) > 0
 
 
+@pytest.mark.slow
 def test_an_exported_function_of_clouds_and_settings_is_serialized_and_called_again():
     cloud, config = street(), DetectorConfig.paper()
     written = jax.export.export(jax.jit(detect))(cloud, config).serialize()

@@ -412,6 +412,7 @@ def test_a_batch_turns_as_long_as_any_of_its_sweeps():
     assert loop_turns.turns_of_sweeps([], DetectorConfig(), together=False) == {}
 
 
+@pytest.mark.slow
 def test_every_loop_of_the_program_for_an_accelerator_is_in_a_step_and_can_be_counted():
     cloud = PointCloud.from_numpy(np.zeros((1, 3), np.float32), capacity=16384)
     with building_for(accelerator=True):

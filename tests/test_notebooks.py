@@ -56,7 +56,7 @@ def count_pictures(cells):
 
 
 @quiet_kernel
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=[path.name for path in NOTEBOOKS])
+@pytest.mark.parametrize("path", parity.slow_but_first(NOTEBOOKS), ids=lambda path: path.name)
 def test_notebook_runs_without_data_and_leaves_nothing_behind(path, tmp_path, monkeypatch):
     monkeypatch.delenv("JAXBOX_KITTI", raising=False)
     if path.stem not in OPTIMISED:
@@ -69,6 +69,7 @@ def test_notebook_runs_without_data_and_leaves_nothing_behind(path, tmp_path, mo
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @quiet_kernel
 def test_the_evaluation_notebook_takes_a_kitti_folder(data_root, tmp_path, monkeypatch):
     monkeypatch.setenv("JAXBOX_KITTI", str(data_root / "kitti_object" / "training"))

@@ -73,7 +73,7 @@ def owners_of(detections, num_points, min_score):
     return np.where(owned[:, None], detections.center[row, :2], 1e6)
 
 
-@pytest.mark.parametrize("preset", list(PRESETS))
+@pytest.mark.parametrize("preset", parity.slow_but_first(PRESETS))
 def test_on_one_ground_plane_both_find_the_same_boxes_of_the_same_points(cases, preset, monkeypatch):
     def use_plane(plane):
         fit = plane.coefficients.astype(float), bool(plane.found), int(plane.num_inliers)
@@ -99,7 +99,7 @@ def test_on_one_ground_plane_both_find_the_same_boxes_of_the_same_points(cases, 
             parity.assert_share(apart.sum(), owned.sum(), 0.02, f"points of the boxes of {preset}")
 
 
-@pytest.mark.parametrize(("preset", "limit"), [("default", 0.3), ("paper", 0.4)])
+@pytest.mark.parametrize(("preset", "limit"), parity.slow_but_first([("default", 0.3), ("paper", 0.4)]))
 def test_on_planes_of_their_own_most_boxes_are_the_same(cases, preset, limit):
     # A point more or less can decide whether a side was seen whole, and so its length. The paper's
     # candidates hold walls too, so that its plane, and with it every height, is less sure.
@@ -107,7 +107,7 @@ def test_on_planes_of_their_own_most_boxes_are_the_same(cases, preset, limit):
     parity.assert_share(bad, total, limit, f"boxes of {preset}, each on its own plane")
 
 
-@pytest.mark.parametrize("preset", list(PRESETS))
+@pytest.mark.parametrize("preset", parity.slow_but_first(PRESETS))
 def test_the_form_for_accelerators_finds_what_the_form_for_a_cpu_does(cases, preset):
     moved, total = 0, 0
     for case in cases[SWEEPS]:
@@ -158,6 +158,7 @@ def test_on_several_planes_boxes_stand_where_those_of_the_reference_do():
     np.testing.assert_allclose(bottoms[0], [ROAD_Z + 0.2, TERRACE_Z + 0.2], atol=0.15)
 
 
+@pytest.mark.slow
 def test_on_two_planes_the_cars_of_a_platform_are_found_as_by_the_reference():
     base = PRESETS["default"]
     config = dataclasses.replace(base, ground=dataclasses.replace(base.ground, max_planes=2))

@@ -225,6 +225,7 @@ def test_a_sweep_of_no_points_has_no_boxes():
     assert_same_bits(d, empty)
 
 
+@pytest.mark.slow
 def test_a_batch_has_the_answers_of_its_sweeps():
     batch = stack_clouds([cloud_of(street(seed).xyz) for seed in (0, 1)])
     found = parity.on_host(jax.vmap(lambda cloud: detect(cloud, TWICE))(batch))

@@ -126,6 +126,7 @@ def test_info_advises_to_level_what_is_tilted_or_seen_from_the_ground(pitch_deg,
     assert sweep_info.advised_options([info], 64) == options
 
 
+@pytest.mark.slow
 def test_detect_sees_a_tilted_sweep_from_the_ground_upright(tmp_path):
     sweep = synthetic.make_sweep(0, num_beams=32, num_azimuths=520)
     sin, cos = np.sin(np.radians(15)), np.cos(np.radians(15))
@@ -153,6 +154,7 @@ def test_detect_sees_a_tilted_sweep_from_the_ground_upright(tmp_path):
     np.testing.assert_allclose(T @ [*sensor_at, 1], [0, 0, 0, 1], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_resuming_where_the_archive_grew_goes_on_in_the_level_frame_of_the_earlier_run(tmp_path):
     xyz = synthetic.make_sweep(0, num_beams=32, num_azimuths=520).xyz
     output, sweeps = tmp_path / "out", tmp_path / "sweeps"

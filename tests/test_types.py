@@ -317,6 +317,7 @@ def test_capacities_enlarged_as_the_errors_ask_clear_every_bit(rounds):
     assert len(rounds) > 1
 
 
+@pytest.mark.slow
 def test_a_capacity_for_obstacles_that_suffices_changes_nothing(rounds):
     config, _ = rounds[-1]
     cloud = PointCloud.from_numpy(STREET[::6], capacity=2**14)

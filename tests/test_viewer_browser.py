@@ -116,6 +116,7 @@ def test_the_shown_score_hides_boxes(visit):
     assert num_boxes(0, min_score=0.25) < num_boxes(0)
 
 
+@pytest.mark.slow
 def test_a_preset_compiles_once_and_sets_the_sliders(visit):
     compiles = visit.number("compiles")
     tolerance = visit.control("plane tolerance").locator("xpath=following-sibling::*//input")
@@ -152,6 +153,7 @@ def test_the_settings_are_copied_and_downloaded(visit, served, tmp_path):
     assert download.value.suggested_filename == "jaxbox.toml"
 
 
+@pytest.mark.slow
 def test_the_timeline_passes_over_a_sweep_that_cannot_be_read(visit):
     visit.type_value("sweep", 2)
     visit.wait(lambda: "000001.bin" in visit.text("error"))

@@ -72,6 +72,7 @@ def outcome(future):
         return error
 
 
+@pytest.mark.slow
 def test_every_item_gets_its_answer_whatever_happens_to_the_others(tmp_path):
     kinds = ["ok", "raise", "kill once", "ok", "exit", "ok", "raise oddly", "return oddly", "ok"]
     items = [(kind, number) for number, kind in enumerate(kinds)] + [("ok", lambda: 0)]
