@@ -55,8 +55,9 @@ def count_pictures(cells):
     return sum("image/jpeg" in output.get("data", {}) for cell in cells for output in cell.outputs)
 
 
+@pytest.mark.slow
 @quiet_kernel
-@pytest.mark.parametrize("path", parity.slow_but_first(NOTEBOOKS), ids=lambda path: path.name)
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.name)
 def test_notebook_runs_without_data_and_leaves_nothing_behind(path, tmp_path, monkeypatch):
     monkeypatch.delenv("JAXBOX_KITTI", raising=False)
     if path.stem not in OPTIMISED:

@@ -17,8 +17,8 @@ from jaxbox.evaluation import pairwise_overlaps
 PROJECT = pathlib.Path(__file__).parents[1]
 CAPACITY = 16384
 SWEEP = synthetic.make_sweep(0, num_beams=32, num_azimuths=520)
-# The fewest maps, so that it compiles fastest.
-CONFIG = DetectorConfig.fast()
+# Whose program other tests take too.
+CONFIG = DetectorConfig()
 SAME_IOU = 0.7
 NUM_FOUND = 3
 """Boxes worth acting on in this sweep, of which most cars hold a few points only."""
@@ -50,8 +50,6 @@ def test_the_boxes_are_vehicles_and_those_of_the_reference(found):
 def test_the_command_line_detects_and_writes(tmp_path):
     np.save(tmp_path / "a.npy", SWEEP.xyz)
     options = [
-        "--preset",
-        "fast",
         "--capacity",
         str(CAPACITY),
         "--format",
