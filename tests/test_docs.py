@@ -93,6 +93,7 @@ def test_links_of_the_projects_files_lead_within_the_site_or_are_words():
     assert links == "[a](install.md) [b](changelog.md) c [d](https://e.org)"
 
 
+@pytest.mark.slow
 def test_the_pipeline_strip_is_of_this_detector(tmp_path):
     load(PROJECT / "examples" / "pipeline_strip.py").main([str(tmp_path / "strip.png")])
     drawn, shown = read_image(tmp_path / "strip.png"), read_image(PROJECT / "docs" / "pipeline.png")

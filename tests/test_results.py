@@ -38,9 +38,10 @@ def found(sweep):
 @pytest.fixture(scope="module")
 def tracks(found):
     """Of two sweeps, so that all that were seen twice are confirmed."""
-    state = TrackerState.empty(16)
+    state, step = TrackerState.empty(16), jax.jit(track_step)
+    seen = jax.jit(observe)(found)
     for _ in range(2):
-        state, result = track_step(state, observe(found), 0.1, np.eye(4, dtype=np.float32))
+        state, result = step(state, seen, 0.1, np.eye(4, dtype=np.float32))
     assert len(result) >= 3
     return result
 

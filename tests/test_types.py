@@ -11,7 +11,7 @@ import numpy as np
 import parity
 import pytest
 
-from jaxbox import Label, PointCloud, Status, detect, stack_clouds, summarise
+from jaxbox import Label, PointCloud, Status, stack_clouds, summarise
 from jaxbox._padding import CAPACITY_BUCKETS
 from jaxbox.config import (
     BoxConfig,
@@ -353,7 +353,7 @@ def test_a_field_is_named_again_only_where_more_was_seen(rounds):
 def test_a_sweep_larger_than_its_cloud_sets_the_bit_and_names_the_capacity(rounds):
     config, clean = rounds[-1]
     more = np.concatenate([STREET, STREET + np.float32(0.001)])
-    detections = detect(PointCloud.from_numpy(more, capacity=2**14), config)
+    detections = parity.detect_quickly(PointCloud.from_numpy(more, capacity=2**14), config)
     assert Status.POINT_OVERFLOW in Status(int(detections.status))
     assert Status.POINT_OVERFLOW not in Status(int(clean.status))
     assert int(detections.counts.dropped_points) == len(more) - 2**14
