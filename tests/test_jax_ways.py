@@ -150,16 +150,18 @@ def unspread_lines(lowered):
     """
     lines, names, same = [], {}, {}
 
-    def renamed(name):
-        return names.setdefault(same.get(name[0], name[0]), f"%{len(names)}")
+    def renamed(value):
+        # One of several results is %5#2.
+        name, *result = same.get(value[0], value[0]).split("#")
+        return "#".join([names.setdefault(name, f"%{len(names)}"), *result])
 
     for line in lowered.as_text().splitlines():
         if "func.func" in line:
             names, same = {}, {}
-        if spread := re.match(r"\s*(%\w+) = sdy\.sharding_constraint (%\w+)", line):
+        if spread := re.match(r"\s*(%\w+) = sdy\.sharding_constraint (%[\w#]+)", line):
             same[spread[1]] = same.get(spread[2], spread[2])
         elif "@main" not in line:
-            lines.append(re.sub(r"%\w+", renamed, line))
+            lines.append(re.sub(r"%[\w#]+", renamed, line))
     return lines
 
 
