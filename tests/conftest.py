@@ -33,17 +33,12 @@ FAST = {
     "test_synthetic.py", "test_tracking_poses.py", "test_tuning.py", "test_types.py", "test_viz.py",
     "test_viz_judged.py", "test_viz_tracks.py", "test_xla_laws.py",
 }  # fmt: skip
-"""Files whose tests make up ``pytest -m fast``, but for the tests in `COMPILING`."""
+"""Files whose tests make up ``pytest -m fast``, but for those in `COMPILING` and those marked slow."""
 COMPILING = {
-    "test_another_class_is_one_entry_in_one_file",
     "test_files_made_to_fill_the_memory_are_refused",
     "test_files_that_claim_or_unpack_to_too_much_are_refused_within_time_and_memory",
     "rounds",
-    "test_the_pictures_of_the_tutorial_are_of_these_steps",
-    "test_the_pipeline_strip_is_of_this_detector",
-    "test_the_proposed_capacities_hold_the_sweeps_they_were_proposed_for",
     "test_the_readme_python_example_runs",
-    "test_the_rough_look_at_real_sweeps_proposes_enough",
 }
 """Tests and fixtures that compile the whole detector, or go through many real sweeps or large files."""
 FIRST = "test_arguments.py"
@@ -93,7 +88,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         # Doctests have no fixtures.
         names = {getattr(item, "originalname", item.name), *getattr(item, "fixturenames", ())}
-        if item.path.name in FAST and not names & COMPILING:
+        if item.path.name in FAST and not names & COMPILING and not item.get_closest_marker("slow"):
             item.add_marker(pytest.mark.fast)
 
 

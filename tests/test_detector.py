@@ -273,7 +273,6 @@ def test_only_an_accelerator_takes_a_batch_at_once_and_not_where_scatters_are_or
     np.testing.assert_array_equal(found, a - b if together else a + b)
 
 
-@pytest.mark.slow
 def test_assignments_beyond_their_capacity_are_counted_and_the_largest_clusters_are_kept():
     full, few = found(0), 24
     completion = dataclasses.replace(DetectorConfig().completion, max_assignments=few)

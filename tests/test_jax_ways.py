@@ -175,6 +175,7 @@ def test_a_batch_over_a_mesh_of_any_type_goes_through_shard_map():
         program = jax.jit(find).lower(batch)
         bodies.append(unspread_lines(program))
     # All but how the arguments and the answer are said to be spread: so that one of them need be compiled.
+    assert any("stablehlo.while" in line for line in bodies[0])
     assert bodies[0] == bodies[1]
     many = program.compile(parity.QUICKLY)(batch)
     assert many.valid.sharding.device_set == set(mesh.devices.flat)
