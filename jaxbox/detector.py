@@ -209,8 +209,7 @@ def score_boxes(completed: Completed, segments: Segments, config: DetectorConfig
     seen, terrain = segments.evidence, segments.ground
     rays = None
     if seen is not None:
-        num, num_rays = completed.hypotheses.num, config.completion.num_final_rays
-        rays = evidence.weigh_boxes(seen, completed.boxes, num, config.evidence, num_rays=num_rays)
+        rays = evidence.weigh_boxes(seen, completed.boxes, completed.hypotheses, config)
     elevation = elevation_of(terrain, config)
     clusters, obstacles, lowest_z = segments.clusters, segments.obstacles, None
     if config.ground.max_planes > 1:

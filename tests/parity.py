@@ -221,7 +221,10 @@ class Case:
         """The reference's evidence in the layout of the compiled stages."""
         blocks = (
             flagged(sums).T.reshape(-1, BLOCK, len(sums))
-            for sums in (self.evidence.free_sums, self.evidence.hit_sums)
+            for sums in (
+                self.evidence.free_sums,
+                np.concatenate([self.evidence.hit_sums, self.evidence.raised_hit_sums]),
+            )
         )
         free, hit = _words_of(*blocks)
         support = jnp.asarray(self.evidence.support, jnp.float32)

@@ -16,7 +16,8 @@ from jaxbox.stages.state import NOT_A_BOX, Boxes, ClassHypotheses, Rectangles
 from jaxbox.xla import range_bits
 
 EVIDENCE = parity.CONFIG.evidence
-NUM_RAYS = parity.CONFIG.completion.num_rays
+NUM_RAYS, NUM_FINAL_RAYS = parity.CONFIG.completion.num_rays, parity.CONFIG.completion.num_final_rays
+CLASSES = parity.CONFIG.vehicles.classes
 
 ground_support = jax.jit(evidence.ground_support)
 first_returns = jax.jit(evidence.first_returns)
@@ -32,17 +33,17 @@ def build_evidence(xyz, height, mask, plane, surface):
 
 
 @parity.PerForm
-def weigh_boxes(seen, boxes, count):
+def weigh_boxes(seen, boxes, label, count):
     length, width, yaw = boxes[:, 2:].T
     flat = Boxes(boxes[:, :2], length, width, yaw, boxes[:, 2:4], length, length > 0)
-    return evidence.weigh_boxes(seen, flat, count, EVIDENCE, num_rays=NUM_RAYS)
+    return evidence.weigh_boxes(seen, flat, ClassHypotheses(label, label, count), parity.CONFIG)
 
 
-@parity.PerForm
-def cast_rays(seen, boxes):
+@functools.partial(parity.PerForm, static_argnames="num_rays")
+def cast_rays(seen, boxes, raised, num_rays):
     length, width, yaw = boxes[:, 2:].T
     flat = types.SimpleNamespace(center=boxes[:, :2], length=length, width=width, yaw=yaw)
-    return evidence.cast_rays(seen, flat, EVIDENCE, num_rays=NUM_RAYS)
+    return evidence.cast_rays(seen, flat, EVIDENCE, num_rays=num_rays, raised=raised)
 
 
 @parity.PerForm
@@ -100,7 +101,9 @@ def test_evidence_differs_in_few_cells_only(cases):
             case.surface,
         )
         hit, free = (range_bits.flagged_cells(np.asarray(words)) for words in (ours.hit, ours.free))
-        hits, frees = (parity.flagged(sums).T for sums in (case.evidence.hit_sums, case.evidence.free_sums))
+        both_hits = np.concatenate([case.evidence.hit_sums, case.evidence.raised_hit_sums])
+        hits, frees = (parity.flagged(sums).T for sums in (both_hits, case.evidence.free_sums))
+        assert np.sum(case.evidence.raised_hit_sums[:, -1]) > np.sum(case.evidence.hit_sums[:, -1])
         other_support = np.asarray(ours.support) != case.evidence.support
         parity.assert_share(np.sum(other_support), 200**2, 2e-3, "support")
         # A rise on the edge of a level may round into the next.
@@ -160,9 +163,14 @@ def test_ground_support_is_looked_up_where_the_reference_does(cases):
 def test_boxes_are_supported_where_the_reference_says(cases):
     rng, num_boxes = np.random.default_rng(1), 512
     for case in cases:
-        boxes = random_boxes(num_boxes, rng)
-        _, expected = reference.weigh_boxes(case.evidence, boxes.astype(float), num_rays=NUM_RAYS)
-        _, support = weigh_boxes(case.evidence_as_input(), boxes, num_boxes)
+        boxes, label = random_boxes(num_boxes, rng), rng.integers(0, len(CLASSES), num_boxes, np.int32)
+        raised = np.array([reference.is_raised(CLASSES[number]) for number in label])
+        _, expected = reference.weigh_boxes(
+            case.evidence, boxes.astype(float), num_rays=NUM_FINAL_RAYS, raised=raised
+        )
+        rays, support = weigh_boxes(case.evidence_as_input(), boxes, label, num_boxes)
+        of_class = cast_rays(case.evidence_as_input(), boxes, raised, NUM_FINAL_RAYS)
+        np.testing.assert_array_equal(rays.hit, of_class.hit)
         # A point of a box may round into the next cell of 1 m.
         parity.assert_share(np.sum(np.asarray(support) != expected), num_boxes, 1e-2, "support")
         of_center = reference.ground_support(case.evidence, boxes[:, :2].astype(float))
@@ -176,8 +184,10 @@ def test_rays_over_boxes_end_as_in_the_reference(cases):
     for case in cases:
         found = [done.box for _, done in case.boxes if done is not None]
         boxes = np.concatenate([random_boxes(512, rng), np.array(found, np.float32)])
-        expected = reference.cast_rays(case.evidence, boxes.astype(float), num_rays=NUM_RAYS)
-        rays = parity.on_host(cast_rays(case.evidence_as_input(), parity.pad(boxes, 1024)))
+        raised = np.arange(len(boxes)) % 3 == 0
+        expected = reference.cast_rays(case.evidence, boxes.astype(float), num_rays=NUM_RAYS, raised=raised)
+        seen = case.evidence_as_input()
+        rays = parity.on_host(cast_rays(seen, parity.pad(boxes, 1024), parity.pad(raised, 1024), NUM_RAYS))
         differ = np.zeros(len(boxes), bool)
         for kind in ("hit", "free", "deep", "occluded", "free_length", "open"):
             gap = np.abs(getattr(rays, kind)[: len(boxes)] - getattr(expected, kind))
@@ -187,6 +197,10 @@ def test_rays_over_boxes_end_as_in_the_reference(cases):
             )
         # A ray on the edge of an azimuth cell, or a range on that of a range cell, may round either way.
         parity.assert_share(differ.sum(), len(boxes), 0.005, "boxes with a ray that ends otherwise")
+        low = reference.cast_rays(case.evidence, boxes.astype(float), num_rays=NUM_RAYS)
+        assert np.all(expected.hit >= low.hit)
+        assert np.all(expected.hit[~raised] == low.hit[~raised])
+        assert np.any(expected.hit > low.hit)
         assert (expected.hit > 0.25).sum() > 10
         assert (expected.free > 0.25).sum() > 10
 

@@ -246,7 +246,7 @@ def test_covered_words_tell_which_cells_intervals_cover_and_how_many_before(num_
     def words_of(first, last, cell, column):
         beams = range_bits.count_changes(size * num_columns, first, last)
         words = range_bits.covered_words(beams.reshape(num_blocks, range_bits.BLOCK, num_columns))
-        return beams, words, range_bits.set_before(*range_bits.words_at([words], [cell], column), cell)
+        return beams, words, range_bits.set_before(*range_bits.words_at([words], [cell], [column]), cell)
 
     for num in (0, 1, 4, 40):
         rng = np.random.default_rng(num)
@@ -288,7 +288,7 @@ def test_next_set_is_the_first_flag_at_a_cell_or_beyond(num_blocks, num_columns)
     @jax.jit
     def search(hits, cell, column):
         words = range_bits.next_words(hits.reshape(num_blocks, range_bits.BLOCK, num_columns))
-        return words, range_bits.next_set(*range_bits.words_at([words], [cell], column), cell)
+        return words, range_bits.next_set(*range_bits.words_at([words], [cell], [column]), cell)
 
     for density in (0.0, 0.03, 0.5, 1.0):
         hits = np.random.default_rng(size).random((size, num_columns)) < density
@@ -306,13 +306,15 @@ def test_next_set_is_the_first_flag_at_a_cell_or_beyond(num_blocks, num_columns)
 def test_beams_are_drawn_cell_by_cell(num_cells, num_columns, num_beams):
     rng = np.random.default_rng(num_cells)
     column = rng.integers(0, num_columns, num_beams, np.int32)
-    hit = rng.random(num_beams) < 0.5, rng.integers(0, num_cells, num_beams, np.int32)
+    hit = rng.random((2, num_beams)) < 0.5, rng.integers(0, num_cells, num_beams, np.int32)
     first, last = np.sort(rng.integers(0, num_cells + 1, (2, num_beams), np.int32), axis=0)
     free = (rng.random(num_beams) < 0.5) & (first < last), first, last
     draw = jax.jit(lambda *beams: range_bits.draw_beams(*beams, num_columns=num_columns, num_cells=num_cells))
     words = draw(column, hit, free)
-    is_free, is_hit = np.zeros((2, (num_cells // range_bits.BLOCK + 1) * range_bits.BLOCK, num_columns), bool)
-    is_hit[hit[1][hit[0]], column[hit[0]]] = True
+    size = (num_cells // range_bits.BLOCK + 1) * range_bits.BLOCK
+    is_free, is_hit = np.zeros((size, num_columns), bool), np.zeros((size, 2 * num_columns), bool)
+    for kind, valid in enumerate(hit[0]):
+        is_hit[hit[1][valid], kind * num_columns + column[valid]] = True
     for k, begin, end in zip(column[free[0]], first[free[0]], last[free[0]], strict=True):
         is_free[begin:end, k] = True
     np.testing.assert_array_equal(range_bits.flagged_cells(words[0]), is_free)
@@ -322,13 +324,11 @@ def test_beams_are_drawn_cell_by_cell(num_cells, num_columns, num_beams):
 @pytest.mark.usefixtures("platform")
 def test_words_at_are_those_of_the_cells_blocks_in_each_table():
     rng = np.random.default_rng(0)
-    tables = rng.integers(0, 2**32, (2, 5, 7), np.uint32)
-    cells, column = (
-        rng.integers(0, 5 * range_bits.BLOCK, (2, 4, 9), np.int32),
-        rng.integers(0, 7, (4, 9), np.int32),
-    )
-    found = jax.jit(lambda *t: range_bits.words_at(t[:2], t[2:4], t[4]))(*tables, *cells, column)
-    for table, cell, words in zip(tables, cells, found, strict=True):
+    tables = [rng.integers(0, 2**32, (5, width), np.uint32) for width in (7, 14)]
+    cells = rng.integers(0, 5 * range_bits.BLOCK, (2, 4, 9), np.int32)
+    columns = [rng.integers(0, table.shape[1], (4, 9), np.int32) for table in tables]
+    found = jax.jit(functools.partial(range_bits.words_at))(tables, list(cells), columns)
+    for table, cell, column, words in zip(tables, cells, columns, found, strict=True):
         np.testing.assert_array_equal(words, table[cell // range_bits.BLOCK, column])
 
 

@@ -69,7 +69,11 @@ class ClassPrior:
     and facades go on there. Those up to .6 m before the end that the sensor sees are its own."""
     open_below: Scalar
     """Share of the free space behind hits that is no evidence against such a vehicle: 1 or more where beams
-    pass below the body, 0 where they do not."""
+    pass below the body, 0 where they do not. Where they do, returns from higher up are hits too, see
+    ``evidence.raised_hit_max_height_m``."""
+    objective_slack: Scalar
+    """A J that is so much lower is as good: the more of such a vehicle lies off the faces of its box, such as
+    wheels below a body and the gap behind a cab."""
     min_open: Scalar
     """Share of the rays over a box that see free space in it, below the body say, where nothing else tells
     such a vehicle from a wall: its top lies above the highest beam, or little of its width was measured. The
@@ -183,6 +187,7 @@ class Label(enum.IntEnum):
         upright_from_m=1.75,
         past_ends_m=0.0,
         open_below=0.0,
+        objective_slack=0.0,
         min_open=0.0,
     )
     VAN = ClassPrior(
@@ -207,6 +212,7 @@ class Label(enum.IntEnum):
         upright_from_m=10.0,
         past_ends_m=0.0,
         open_below=0.0,
+        objective_slack=0.0,
         min_open=0.0,
     )
     TRUCK = ClassPrior(
@@ -231,5 +237,6 @@ class Label(enum.IntEnum):
         upright_from_m=10.0,
         past_ends_m=2.0,
         open_below=1.0,
+        objective_slack=0.2,
         min_open=0.05,
     )

@@ -54,7 +54,8 @@ _POSITIVE = """
     filtering.bandwidth_m filtering.num_std
     ground.tolerance_m ground.smoothing_m ground.max_height_m
     clustering.max_extent_m completion.end_slope completion.end_points
-    evidence.hit_max_height_m evidence.free_max_height_m evidence.support_height_m
+    evidence.hit_max_height_m evidence.raised_hit_max_height_m evidence.free_max_height_m
+    evidence.support_height_m
     box.slab_max_height_m box.min_distance_m box.direction_sigma_deg
     vehicles.classes.length_m vehicles.classes.width_m vehicles.classes.height_m
     vehicles.classes.length_below_m vehicles.classes.length_above_m vehicles.classes.width_tolerance_m
@@ -71,7 +72,7 @@ _SHARES = """
     ground.min_inlier_fraction ground.min_support_share box.direction_max_free box.min_slab_share
     completion.seen_weight
     health.min_far_share health.max_scattered_share health.max_rough_share health.max_under_share
-    vehicles.hidden_length_score vehicles.unseen_top_score vehicles.classes.min_open
+    vehicles.own_share vehicles.hidden_length_score vehicles.unseen_top_score vehicles.classes.min_open
     vehicles.tall_upright_score vehicles.top_quantile vehicles.upright_score
     vehicles.min_score vehicles.max_overlap
     birth_score high_score low_score hidden_share yaw_memory yaw_memory_moving turn_gain

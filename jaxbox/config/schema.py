@@ -196,6 +196,8 @@ class EvidenceConfig:
     """A return between these heights is a hit."""
     hit_max_height_m: Scalar = 1.2
     """See ``hit_min_height_m``."""
+    raised_hit_max_height_m: Scalar = 2.0
+    """The same for vehicles with a raised body, below which beams pass, see ``ClassPrior.open_below``."""
     free_min_height_m: Scalar = 0.35
     """A beam between these heights shows that the space is free."""
     free_max_height_m: Scalar = 0.8
@@ -367,6 +369,9 @@ class VehicleConfig:
     """score x exp(-(free length of the rays inside / scale)^2), besides x the fraction of rays that hit."""
     ring_weight: Scalar = 8.0
     """score x exp(-weight x ring points / points)."""
+    own_share: Scalar = 0.5
+    """Score x the share of the points in the box that its cluster holds / this, where it holds less: the rest
+    of a hedge or a house fills the box of its part."""
     overhead_weight: Scalar = 6.0
     """score x exp(-weight x points above / points), where those above are connected to the vehicle."""
     hidden_length_score: Scalar = 0.7

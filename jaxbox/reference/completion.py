@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, Scalar, VehicleConfig
-from jaxbox.reference.evidence import cast_rays, closed_free_length
+from jaxbox.reference.evidence import cast_rays, closed_free_length, is_raised
 from jaxbox.reference.rows import find_rows, hit_share, visible_end
 from jaxbox.reference.state import (
     Assignment,
@@ -212,7 +212,7 @@ def complete_box(
                 continue
             between = (i, side) in in_row
             placed = place_widths(sides, prior)
-            rays = cast_rays(evidence, placed, num_rays=config.num_rays)
+            rays = cast_rays(evidence, placed, num_rays=config.num_rays, raised=is_raised(prior))
             free_length, hit = closed_free_length(rays, prior), hit_share(rays, between)
             rays = dataclasses.replace(rays, hit=hit, free_length=free_length)
             agreement = point_agreement(placed, xy, config)

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy import ndimage
 
-from jaxbox.config import ClassPrior, EvidenceConfig
+from jaxbox.config import ClassPrior, EvidenceConfig, Scalar
 from jaxbox.reference.state import Evidence, Ground, RayFractions, Sweep
 
 SUPPORT_HALF_M = 100
@@ -91,10 +91,11 @@ def build_evidence(
     xyz, height, rho = xyz[far], height[far], rho[far]
     azimuth = azimuth_cell(np.arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths)
 
-    hits = np.zeros((num_azimuths, num_ranges + 1), int)
-    hit = (height > config.hit_min_height_m) & (height < config.hit_max_height_m)
-    hit &= rho < num_ranges * range_cell_m
-    np.add.at(hits, (azimuth[hit], (rho[hit] / range_cell_m).astype(int)), 1)
+    def hits_below(top_m: Scalar) -> np.ndarray:
+        hits = np.zeros((num_azimuths, num_ranges + 1), int)
+        hit = (height > config.hit_min_height_m) & (height < top_m) & (rho < num_ranges * range_cell_m)
+        np.add.at(hits, (azimuth[hit], (rho[hit] / range_cell_m).astype(int)), 1)
+        return _sums_before(hits)
 
     start, end = _free_interval(xyz, height, sensor_height_m, ground_elevation, config)
     # Only cells that lie wholly within the interval are free.
@@ -106,7 +107,8 @@ def build_evidence(
     np.add.at(steps, (azimuth[passes], last[passes]), -1)
     free = np.cumsum(steps, axis=1) > 0
     steepest = steepest_beam(xyz[:, 2], rho)
-    return Evidence(_sums_before(hits), _sums_before(free), support, steepest, range_cell_m)
+    hits, raised_hits = hits_below(config.hit_max_height_m), hits_below(config.raised_hit_max_height_m)
+    return Evidence(hits, raised_hits, _sums_before(free), support, steepest, range_cell_m)
 
 
 def steepest_beam(z: np.ndarray, rho: np.ndarray) -> float:
@@ -212,20 +214,23 @@ def ground_support(evidence: Evidence, xy: np.ndarray) -> np.ndarray:
     return evidence.support[cell[..., 0], cell[..., 1]]
 
 
-def weigh_boxes(evidence: Evidence, boxes: np.ndarray, *, num_rays: int) -> tuple[RayFractions, np.ndarray]:
+def weigh_boxes(
+    evidence: Evidence, boxes: np.ndarray, *, num_rays: int, raised: np.ndarray | bool = False
+) -> tuple[RayFractions, np.ndarray]:
     """What the rays over each box met, and the ground support round it.
 
     Args:
       evidence: of the sweep.
       boxes: (B, 5): x, y, length, width in m and yaw in rad.
       num_rays: rays a box.
+      raised: (B,), see `cast_rays`.
 
     Returns:
       The fractions, and (B,) int: ground points round its centre or, if more, round its point nearest to the
       sensor, see `ground_support`.
     """
     support = [ground_support(evidence, place) for place in (boxes[:, :2], _nearest_points(boxes))]
-    return cast_rays(evidence, boxes, num_rays=num_rays), np.maximum(*support)
+    return cast_rays(evidence, boxes, num_rays=num_rays, raised=raised), np.maximum(*support)
 
 
 def _nearest_points(boxes: np.ndarray) -> np.ndarray:
@@ -239,13 +244,16 @@ def _nearest_points(boxes: np.ndarray) -> np.ndarray:
     return nearest.T
 
 
-def cast_rays(evidence: Evidence, boxes: np.ndarray, *, num_rays: int) -> RayFractions:
+def cast_rays(
+    evidence: Evidence, boxes: np.ndarray, *, num_rays: int, raised: np.ndarray | bool = False
+) -> RayFractions:
     """Sends rays over each box, evenly over the azimuths that it spans, and asks the evidence.
 
     Args:
       evidence: of the sweep.
       boxes: (B, 5): x, y, length, width in m and yaw in rad.
       num_rays: rays a box.
+      raised: (B,) or one for all: whether beams pass below the body, so that higher returns are hits too.
 
     Returns:
       The fractions.
@@ -264,9 +272,13 @@ def cast_rays(evidence: Evidence, boxes: np.ndarray, *, num_rays: int) -> RayFra
     def between(sums: np.ndarray, first: np.ndarray, end: np.ndarray) -> np.ndarray:
         return sums[azimuth, end] - sums[azimuth, first]
 
+    def returns(first: np.ndarray, end: np.ndarray) -> np.ndarray:
+        low, high = (between(sums, first, end) for sums in (evidence.hit_sums, evidence.raised_hit_sums))
+        return np.where(np.broadcast_to(raised, len(boxes))[:, None], high, low)
+
     front = cell(entry - HIT_BEFORE_M, 0)
-    hits = between(evidence.hit_sums, front, cell(np.minimum(entry + HIT_BEHIND_M, exit_ + HIT_EXIT_M), 1))
-    all_hits = between(evidence.hit_sums, front, cell(exit_ + DEEP_EXIT_M, 1))
+    hits = returns(front, cell(np.minimum(entry + HIT_BEHIND_M, exit_ + HIT_EXIT_M), 1))
+    all_hits = returns(front, cell(exit_ + DEEP_EXIT_M, 1))
     first, end = cell(entry + FREE_BEHIND_M, 1), cell(exit_ - FREE_BEFORE_M, 0)
     length = counted * np.maximum(end - first, 0)
     free = counted * between(evidence.free_sums, first, np.maximum(first, end))
@@ -283,6 +295,11 @@ def cast_rays(evidence: Evidence, boxes: np.ndarray, *, num_rays: int) -> RayFra
         free_length=free.sum(axis=1) / np.maximum(length.sum(axis=1), 1),
         open=(free > 0).sum(axis=1) / total,
     )
+
+
+def is_raised(prior: ClassPrior) -> bool:
+    """Whether beams pass below the bodies of a class."""
+    return float(prior.open_below) > 0
 
 
 def closed_free_length(rays: RayFractions, prior: ClassPrior) -> np.ndarray:

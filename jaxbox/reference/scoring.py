@@ -79,6 +79,7 @@ def score_boxes(
         lowest_z = obstacles.xyz[cluster.members, 2].min() if config.ground.max_planes > 1 else 0.0
         where = rho, reach(box.box, lowest_z), box.measured_width_m, float(is_open[row]), threes
         late, top_unseen = neighbourhood_score(around, *where, prior, config.vehicles)
+        late *= own_score(around, len(cluster.members), config.vehicles)
         return Candidate(hypothesis, box, around, top_unseen, score * late)
 
     pairs = zip(completed.hypotheses, completed.boxes, strict=True)
@@ -161,6 +162,21 @@ def _end_where_seen(
     beam_angle = 2 * np.pi / config.evidence.num_azimuths
     ended, seen = end_where_seen(box.box, around, usual_m, config.completion, beam_angle)
     return ended, max(seen, share_seen(box.measured_length_m, usual_m, config.completion.seen_length))
+
+
+def own_score(around: NeighbourhoodCounts, num_points: int, config: VehicleConfig) -> float:
+    """What a box counts of whose points its cluster holds a small share only.
+
+    Args:
+      around: points in and round the box.
+      num_points: of the cluster.
+      config: from which share on it counts in full.
+
+    Returns:
+      In [0, 1].
+    """
+    own = num_points / max(float(around.num_inside), 1.0)
+    return 1.0 if own >= config.own_share else own / float(config.own_share)
 
 
 def keep_best(candidates: Sequence[Candidate], config: VehicleConfig) -> Kept:
@@ -255,7 +271,8 @@ def score_box(
     )
     rho = float(np.hypot(box.box[0], box.box[1]))
     where = rho, reach, box.measured_width_m, is_open, in_threes
-    return early * neighbourhood_score(around, *where, prior, config)[0]
+    own = own_score(around, num_points, config)
+    return early * own * neighbourhood_score(around, *where, prior, config)[0]
 
 
 def early_score(
@@ -272,7 +289,8 @@ def early_score(
     if max(box.measured_length_m, box.measured_width_m) < config.min_extent_m:
         return 0.0
     rho = float(np.hypot(box.box[0], box.box[1]))
-    score = evidence_score(num_points, hit, free_length, support, rho, box.objective, config)
+    objective = box.objective + float(prior.objective_slack)
+    score = evidence_score(num_points, hit, free_length, support, rho, objective, config)
     return float(score * size_score(box.box[2:4], prior) * prior.prior_weight)
 
 

@@ -120,6 +120,8 @@ class Evidence:
 
     hit_sums: np.ndarray
     """(azimuths, ranges + 1) int: returns between the hit heights in all range cells before."""
+    raised_hit_sums: np.ndarray
+    """Likewise, returns that are hits of vehicles with a raised body."""
     free_sums: np.ndarray
     """(azimuths, ranges + 1) int: free range cells before."""
     support: np.ndarray

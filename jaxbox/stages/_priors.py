@@ -65,6 +65,18 @@ def closed_free_length(rays: RayFractions, prior: ClassPrior) -> jax.Array:
     return rays.free_length + share * (beside - rays.free_length)
 
 
+def is_raised(prior: ClassPrior) -> jax.Array:
+    """Whether beams pass below the bodies of a class, so that returns from higher up are hits too.
+
+    Args:
+      prior: fields of (...) float32.
+
+    Returns:
+      (...) bool.
+    """
+    return jnp.asarray(prior.open_below) > 0
+
+
 def size_score(length: jax.Array, width: jax.Array, prior: ClassPrior) -> jax.Array:
     """How well the box's length and width match the class.
 

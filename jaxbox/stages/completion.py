@@ -24,7 +24,7 @@ from jaxbox.stages._assignments import (
     longer_side,
     place,
 )
-from jaxbox.stages._priors import closed_free_length, prior_of
+from jaxbox.stages._priors import closed_free_length, is_raised, prior_of
 from jaxbox.stages._rows import find_rows, hit_share, visible_ends
 from jaxbox.stages.state import (
     NOT_A_BOX,
@@ -222,8 +222,10 @@ def _judge_assignments(
 
     def judge(rows: tuple[Any, ...]) -> tuple[jax.Array, jax.Array]:
         (boxes, score, cluster, label), in_row = rows
-        rays = cast_rays(boxes, num_rays=config.completion.num_rays)
-        closed = closed_free_length(rays, prior_of(config.vehicles.classes, label))
+        prior = prior_of(config.vehicles.classes, label)
+        raised = is_raised(prior)[None]
+        rays = cast_rays(boxes, num_rays=config.completion.num_rays, raised=raised)
+        closed = closed_free_length(rays, prior)
         rays = dataclasses.replace(rays, hit=hit_share(rays, in_row), free_length=closed)
         agreement = point_agreement(boxes, *points.table(cluster), config.completion)
         return choose_placement(score, agreement, rays, config.completion)

@@ -6,10 +6,20 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from jaxbox.config import EvidenceConfig
+from jaxbox.config import DetectorConfig, EvidenceConfig
 from jaxbox.geometry.planar import rotate
 from jaxbox.stages._grids import sum_of_neighbours
-from jaxbox.stages.state import Boxes, Evidence, FlatBoxes, Ground, GroundElevation, RayFractions, Sweep
+from jaxbox.stages._priors import is_raised, prior_of
+from jaxbox.stages.state import (
+    Boxes,
+    ClassHypotheses,
+    Evidence,
+    FlatBoxes,
+    Ground,
+    GroundElevation,
+    RayFractions,
+    Sweep,
+)
 from jaxbox.xla import chunks
 from jaxbox.xla.arithmetic import arctan2, cos_sin
 from jaxbox.xla.bits import sum_packed
@@ -116,8 +126,8 @@ def build_evidence(
     num_azimuths, num_ranges, range_cell_m = config.num_azimuths, config.num_ranges, config.range_cell_m
     rho = jnp.sqrt(xyz[:, 0] ** 2 + xyz[:, 1] ** 2)
     returned = mask & (rho >= config.min_range_m)
-    is_hit = returned & (config.hit_min_height_m < height) & (height < config.hit_max_height_m)
-    is_hit = is_hit & (rho < num_ranges * range_cell_m)
+    may_hit = returned & (config.hit_min_height_m < height) & (rho < num_ranges * range_cell_m)
+    tops = config.hit_max_height_m, config.raised_hit_max_height_m
 
     drop = height - sensor_height_m
     downward = returned & (drop < -MIN_DROP_M)
@@ -137,7 +147,7 @@ def build_evidence(
     is_free = downward & (last_m > first_m) & (last > first)
     free, hit = draw_beams(
         azimuth_cell(arctan2(xyz[:, 1], xyz[:, 0]), num_azimuths),
-        (is_hit, (rho / range_cell_m).astype(jnp.int32)),
+        ([may_hit & (height < top) for top in tops], (rho / range_cell_m).astype(jnp.int32)),
         (is_free, first, last),
         num_columns=num_azimuths,
         num_cells=num_ranges,
@@ -189,7 +199,7 @@ def first_returns(evidence: Evidence | None, config: EvidenceConfig) -> jax.Arra
     """
     end = jnp.full(config.num_azimuths, config.num_ranges, jnp.int32)
     if evidence is not None:
-        end = jnp.minimum(next_set(evidence.hit[0], jnp.zeros_like(end)), end)
+        end = jnp.minimum(next_set(evidence.hit[0, : end.size], jnp.zeros_like(end)), end)
     return end.astype(jnp.float32) * config.range_cell_m
 
 
@@ -238,7 +248,14 @@ def ground_support(evidence: Evidence, xy: jax.Array) -> jax.Array:
     return lookup(evidence.support, index[..., 0], index[..., 1])
 
 
-def cast_rays(evidence: Evidence, boxes: FlatBoxes, config: EvidenceConfig, *, num_rays: int) -> RayFractions:
+def cast_rays(
+    evidence: Evidence,
+    boxes: FlatBoxes,
+    config: EvidenceConfig,
+    *,
+    num_rays: int,
+    raised: jax.Array | bool = False,
+) -> RayFractions:
     """Casts rays evenly over the azimuths that a box spans, and classifies them by what they met.
 
     A ray enters the box at e and leaves it at x. It hits where there is a return about e; else it is
@@ -249,6 +266,7 @@ def cast_rays(evidence: Evidence, boxes: FlatBoxes, config: EvidenceConfig, *, n
       boxes: centres (..., 2), and sizes and yaw that broadcast to (...).
       config: that the evidence was built with.
       num_rays: static.
+      raised: bool, broadcasts to (...): whether beams pass below the body, so that higher returns are hits.
 
     Returns:
       The fractions.
@@ -259,11 +277,14 @@ def cast_rays(evidence: Evidence, boxes: FlatBoxes, config: EvidenceConfig, *, n
     sides = (jnp.broadcast_to(a, shape).reshape(-1) for a in (boxes.length, boxes.width, boxes.yaw))
     length, width, yaw = sides
     axis = fast_axis()
+    raised = jnp.expand_dims(jnp.broadcast_to(raised, shape).reshape(-1), axis)
     met = apply_in_turn(
         [
             lambda boxes: _ray_fan(*boxes),
             lambda fan: _ray_intervals(fan, num_rays, axis),
-            lambda intervals: _classify_rays(evidence, *intervals, range_cell_m=config.range_cell_m),
+            lambda intervals: _classify_rays(
+                evidence, *intervals, raised=raised, range_cell_m=config.range_cell_m
+            ),
         ],
         (center, length / 2, width / 2, yaw),
     )
@@ -282,16 +303,15 @@ def cast_rays(evidence: Evidence, boxes: FlatBoxes, config: EvidenceConfig, *, n
 
 
 def weigh_boxes(
-    evidence: Evidence, boxes: Boxes, num_boxes: jax.Array, config: EvidenceConfig, *, num_rays: int
+    evidence: Evidence, boxes: Boxes, hypotheses: ClassHypotheses, config: DetectorConfig
 ) -> tuple[RayFractions, jax.Array]:
     """What the rays over each box met, and the ground support round it.
 
     Args:
       evidence: of the sweep.
       boxes: (Q,) of them.
-      num_boxes: () int32, how many count.
-      config: that the evidence was built with.
-      num_rays: static.
+      hypotheses: that they are of: their classes, and how many count.
+      config: the classes, the rays over each box, and what the evidence was built with.
 
     Returns:
       rays: (Q,) fractions.
@@ -299,11 +319,16 @@ def weigh_boxes(
         sensor: the middle of a long vehicle may lie out of sight. See `ground_support`.
     """
 
-    def weigh(boxes: Boxes) -> tuple[RayFractions, jax.Array]:
-        support = [ground_support(evidence, place) for place in (boxes.center, _nearest_point(boxes))]
-        return cast_rays(evidence, boxes, config, num_rays=num_rays), jnp.maximum(*support)
+    num_rays = config.completion.num_final_rays
 
-    return map_rows(weigh, boxes, num_rows=num_boxes, chunk=chunks.RAYS)
+    def weigh(rows: tuple[Boxes, jax.Array]) -> tuple[RayFractions, jax.Array]:
+        boxes, label = rows
+        raised = is_raised(prior_of(config.vehicles.classes, label))
+        support = [ground_support(evidence, place) for place in (boxes.center, _nearest_point(boxes))]
+        rays = cast_rays(evidence, boxes, config.evidence, num_rays=num_rays, raised=raised)
+        return rays, jnp.maximum(*support)
+
+    return map_rows(weigh, (boxes, hypotheses.label), num_rows=hypotheses.num, chunk=chunks.RAYS)
 
 
 def _nearest_point(boxes: Boxes) -> jax.Array:
@@ -359,6 +384,8 @@ def _classify_rays(
     azimuth: jax.Array,
     enter: jax.Array,
     leave: jax.Array,
+    *,
+    raised: jax.Array,
     range_cell_m: float,
 ) -> tuple[jax.Array, ...]:
     """Whether each ray is a hit, free, deep, open, and crosses the box; its free and all its cells inside."""
@@ -374,7 +401,8 @@ def _classify_rays(
     last = jnp.maximum(cell(leave - FREE_BEFORE_M, 0), first)
     column = azimuth_cell(azimuth, num_azimuths)
     tables = evidence.hit, evidence.free, evidence.free
-    near_word, first_word, last_word = words_at(tables, (near, first, last), column)
+    columns = column + jnp.where(raised, num_azimuths, 0), column, column
+    near_word, first_word, last_word = words_at(tables, (near, first, last), columns)
     met_at = next_set(near_word, near)
     is_hit = crosses & (met_at < cell(jnp.minimum(enter + HIT_AFTER_M, leave + HIT_BEYOND_M), 1))
     cells = jnp.where(crosses, last - first, 0)

@@ -152,7 +152,8 @@ def _early_scores(
             support = rays[1]
         num_points = take(clusters.num_points, cluster)
         rho = jnp.linalg.norm(boxes.center, axis=1)
-        by_evidence = evidence_score(num_points, hit, free_length, support, rho, boxes.objective, config)
+        objective = boxes.objective + prior.objective_slack
+        by_evidence = evidence_score(num_points, hit, free_length, support, rho, objective, config)
         by_size = size_score(boxes.length, boxes.width, prior)
         score = by_evidence * by_size * prior.prior_weight
         large_enough = jnp.max(boxes.measured, axis=1) >= config.min_extent_m
@@ -222,7 +223,7 @@ def _finish(rows: tuple[Any, ...], reach: jax.Array, clusters: Clusters, config:
         # The paper keeps the height of the cluster itself.
         bottom = take(clusters.low[:, 2], cluster)
         height = take(clusters.high[:, 2], cluster) - bottom
-    total = score * late
+    total = score * late * own_score(around, take(clusters.num_points, cluster), config)
     total = jnp.where(total > config.min_score, total, 0)
     return Candidates(rectangle, bottom, height, total, label, cluster, total > 0, jnp.zeros_like(label))
 
@@ -396,6 +397,23 @@ def _upright_score(
     tall = jnp.clip((top - prior.upright_from_m) / UPRIGHT_RAMP_M, 0, 1) * _nearly_wide(seen_width)
     may_be = jnp.where(in_threes, 1, tall)
     return config.upright_score + (config.tall_upright_score - config.upright_score) * may_be
+
+
+def own_score(around: NeighbourhoodCounts, num_points: jax.Array, config: VehicleConfig) -> jax.Array:
+    """What boxes count that are filled by other points than those of their cluster: part of a hedge, say.
+
+    Args:
+      around: see `count_points_around`.
+      num_points: (P,) int32, points of the cluster.
+      config: the least share of the points inside that counts in full.
+
+    Returns:
+      (P,) float32 in [0, 1]: the share of the points inside that are its cluster's, over the least.
+
+    Reference: oracle `jaxbox.reference.own_score`.
+    """
+    own = num_points.astype(jnp.float32) / jnp.maximum(around.num_inside, 1)
+    return jnp.where(own < config.own_share, own / jnp.maximum(config.own_share, own), 1)
 
 
 def _nearly_wide(seen_width: jax.Array) -> jax.Array:

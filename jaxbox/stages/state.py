@@ -188,8 +188,8 @@ class Evidence:
     free: jax.Array
     """(B, A) uint32: which cells of a block are free, and how many before the block (`covered_words`)."""
     hit: jax.Array
-    """(B, A) uint32: which cells of a block have a return of vehicle height, and the first beyond the block
-    that has one (`next_words`)."""
+    """(B, 2 A) uint32: which cells of a block have a return of vehicle height, and the first beyond the block
+    that has one (`next_words`); then the same with higher returns, for vehicles with a raised body."""
     support: jax.Array
     """(200, 200) float32: ground points in the 7 x 7 m round each 1 m cell."""
     steepest: jax.Array
@@ -244,8 +244,8 @@ class FlatBoxes(Protocol):
 class CastRays(Protocol):
     """Asks the evidence what the rays over boxes met: `jaxbox.stages.evidence.cast_rays` of one sweep."""
 
-    def __call__(self, boxes: FlatBoxes, *, num_rays: int) -> RayFractions:
-        """As many rays as said over each box."""
+    def __call__(self, boxes: FlatBoxes, *, num_rays: int, raised: jax.Array | bool = False) -> RayFractions:
+        """As many rays as said over each box; whether bodies are raised broadcasts to them."""
         ...
 
 

@@ -44,7 +44,7 @@ def count_changes(size: int, first: jax.Array, last: jax.Array) -> jax.Array:
 
 def draw_beams(
     column: jax.Array,
-    hit: tuple[jax.Array, jax.Array],
+    hit: tuple[Sequence[jax.Array], jax.Array],
     free: tuple[jax.Array, jax.Array, jax.Array],
     *,
     num_columns: int,
@@ -56,7 +56,8 @@ def draw_beams(
 
     Args:
       column: (N,) int32, of each beam; it is stored once for the three scatters that read it.
-      hit: (N,) bool, whether a beam hits a cell, and (N,) int32, that cell, in [0, num_cells).
+      hit: for each of H kinds of hits (N,) bool, whether a beam hits a cell, and (N,) int32, that cell, in
+        [0, num_cells).
       free: (N,) bool, whether a beam is free anywhere, and (N,) int32 twice, the first cell where it is and
         the first beyond, in [0, num_cells].
       num_columns: static, A.
@@ -64,19 +65,22 @@ def draw_beams(
 
     Returns:
       free: (B, A) uint32, see `covered_words`.
-      hit: (B, A) uint32, see `next_words`.
+      hit: (B, H A) uint32, see `next_words`: all columns of the first kind, then of the next.
     """
     num_blocks = num_cells // BLOCK + 1
-    shape, size = (num_blocks, BLOCK, num_columns), num_blocks * BLOCK * num_columns
+    size = num_blocks * BLOCK * num_columns
     column = materialize(column)
 
     def place(valid: jax.Array, cell: jax.Array) -> jax.Array:
         return jnp.where(valid, cell * num_columns + column, size)
 
     is_free, first, last = free
-    hits = scatter("set", jnp.zeros(size, bool), place(*hit), True)
     beams = count_changes(size, place(is_free, first), place(is_free, last))
-    return covered_words(beams.reshape(shape)), next_words(hits.reshape(shape))
+    is_hit, hit_cell = hit
+    hits = [scatter("set", jnp.zeros(size, bool), place(valid, hit_cell), True) for valid in is_hit]
+    shape = num_blocks, BLOCK, num_columns
+    kinds = jnp.concatenate([each.reshape(shape) for each in hits], axis=2)
+    return covered_words(beams.reshape(shape)), next_words(kinds)
 
 
 def covered_words(beams: jax.Array) -> jax.Array:
@@ -172,20 +176,23 @@ def set_before(words: jax.Array, cell: jax.Array) -> jax.Array:
     return (words >> BLOCK).astype(jnp.int32) + count_bits(words & below)
 
 
-def words_at(tables: Sequence[jax.Array], cells: Sequence[jax.Array], column: jax.Array) -> list[jax.Array]:
+def words_at(
+    tables: Sequence[jax.Array], cells: Sequence[jax.Array], columns: Sequence[jax.Array]
+) -> list[jax.Array]:
     """The words of cells. Law: ``table[cell // 16, column]`` of each table.
 
     Args:
-      tables: (B, A) uint32 each.
+      tables: (B, columns) uint32 each.
       cells: (...) int32 of each.
-      column: (...) int32.
+      columns: (...) int32 of each.
 
     Returns:
       (...) uint32 of each table.
     """
     # What a look-up has to work out first does not vectorise.
     cells = materialize(tuple(cells))
-    places = materialize([(cell >> BLOCK_BITS) * tables[0].shape[1] + column for cell in cells])
+    of_each = zip(tables, cells, columns, strict=True)
+    places = materialize([(cell >> BLOCK_BITS) * table.shape[1] + column for table, cell, column in of_each])
     return [lookup(table.reshape(-1), place) for table, place in zip(tables, places, strict=True)]
 
 
