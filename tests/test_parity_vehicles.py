@@ -106,7 +106,7 @@ def score_boxes(columns, prior):
     seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "rho"))
     where = (columns[name] for name in ("rho", "reach", "seen_width", "is_open", "in_threes"))
     early = scoring.evidence_score(*seen, columns["objective"] + prior.objective_slack, SETTINGS)
-    own = scoring.own_score(around, columns["num_points"], SETTINGS)
+    own = scoring.own_score(around, columns["num_points"], prior)
     late, top_unseen = scoring.neighbourhood_score(around, *where, prior, SETTINGS)
     by_size = scoring.size_score(columns["length"], columns["width"], prior)
     return early * by_size * own * late * prior.prior_weight, top_unseen
@@ -182,9 +182,10 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
 def test_a_box_that_others_fill_counts_by_the_share_of_its_own_points():
     inside = np.array([100, 100, 100, 60, 0], np.float32)
     around = NeighbourhoodCounts(np.stack([inside, *np.zeros((6, 5), np.float32)], axis=1))
-    own = scoring.own_score(around, np.array([100, 50, 20, 90, 3]), SETTINGS)
+    truck = SETTINGS.classes[2]
+    own = scoring.own_score(around, np.array([100, 50, 20, 90, 3]), truck)
     np.testing.assert_allclose(own, [1, 1, 0.4, 1, 1], atol=1e-6)
-    no_gate = dataclasses.replace(SETTINGS, own_share=0.0)
+    no_gate = dataclasses.replace(truck, own_share=0.0)
     np.testing.assert_array_equal(scoring.own_score(around, np.zeros(5, np.int32), no_gate), 1)
 
 

@@ -74,6 +74,9 @@ class ClassPrior:
     objective_slack: Scalar
     """A J that is so much lower is as good: the more of such a vehicle lies off the faces of its box, such as
     wheels below a body and the gap behind a cab."""
+    own_share: Scalar
+    """Score x the share of the points in the box that its cluster holds / this, where it holds less: the rest
+    of a hedge or a house fills the box of its part. 0 asks for nothing."""
     min_open: Scalar
     """Share of the rays over a box that see free space in it, below the body say, where nothing else tells
     such a vehicle from a wall: its top lies above the highest beam, or little of its width was measured. The
@@ -188,6 +191,7 @@ class Label(enum.IntEnum):
         past_ends_m=0.0,
         open_below=0.0,
         objective_slack=0.0,
+        own_share=0.0,
         min_open=0.0,
     )
     VAN = ClassPrior(
@@ -213,6 +217,7 @@ class Label(enum.IntEnum):
         past_ends_m=0.0,
         open_below=0.0,
         objective_slack=0.0,
+        own_share=0.5,
         min_open=0.0,
     )
     TRUCK = ClassPrior(
@@ -238,5 +243,6 @@ class Label(enum.IntEnum):
         past_ends_m=2.0,
         open_below=1.0,
         objective_slack=0.2,
+        own_share=0.5,
         min_open=0.05,
     )

@@ -72,7 +72,8 @@ _SHARES = """
     ground.min_inlier_fraction ground.min_support_share box.direction_max_free box.min_slab_share
     completion.seen_weight
     health.min_far_share health.max_scattered_share health.max_rough_share health.max_under_share
-    vehicles.own_share vehicles.hidden_length_score vehicles.unseen_top_score vehicles.classes.min_open
+    vehicles.hidden_length_score vehicles.unseen_top_score vehicles.classes.min_open
+    vehicles.classes.own_share
     vehicles.tall_upright_score vehicles.top_quantile vehicles.upright_score
     vehicles.min_score vehicles.max_overlap
     birth_score high_score low_score hidden_share yaw_memory yaw_memory_moving turn_gain

@@ -369,9 +369,6 @@ class VehicleConfig:
     """score x exp(-(free length of the rays inside / scale)^2), besides x the fraction of rays that hit."""
     ring_weight: Scalar = 8.0
     """score x exp(-weight x ring points / points)."""
-    own_share: Scalar = 0.5
-    """Score x the share of the points in the box that its cluster holds / this, where it holds less: the rest
-    of a hedge or a house fills the box of its part."""
     overhead_weight: Scalar = 6.0
     """score x exp(-weight x points above / points), where those above are connected to the vehicle."""
     hidden_length_score: Scalar = 0.7

@@ -79,7 +79,7 @@ def score_boxes(
         lowest_z = obstacles.xyz[cluster.members, 2].min() if config.ground.max_planes > 1 else 0.0
         where = rho, reach(box.box, lowest_z), box.measured_width_m, float(is_open[row]), threes
         late, top_unseen = neighbourhood_score(around, *where, prior, config.vehicles)
-        late *= own_score(around, len(cluster.members), config.vehicles)
+        late *= own_score(around, len(cluster.members), prior)
         return Candidate(hypothesis, box, around, top_unseen, score * late)
 
     pairs = zip(completed.hypotheses, completed.boxes, strict=True)
@@ -164,19 +164,19 @@ def _end_where_seen(
     return ended, max(seen, share_seen(box.measured_length_m, usual_m, config.completion.seen_length))
 
 
-def own_score(around: NeighbourhoodCounts, num_points: int, config: VehicleConfig) -> float:
+def own_score(around: NeighbourhoodCounts, num_points: int, prior: ClassPrior) -> float:
     """What a box counts of whose points its cluster holds a small share only.
 
     Args:
       around: points in and round the box.
       num_points: of the cluster.
-      config: from which share on it counts in full.
+      prior: from which share on it counts in full.
 
     Returns:
       In [0, 1].
     """
     own = num_points / max(float(around.num_inside), 1.0)
-    return 1.0 if own >= config.own_share else own / float(config.own_share)
+    return 1.0 if own >= prior.own_share else own / float(prior.own_share)
 
 
 def keep_best(candidates: Sequence[Candidate], config: VehicleConfig) -> Kept:
@@ -271,7 +271,7 @@ def score_box(
     )
     rho = float(np.hypot(box.box[0], box.box[1]))
     where = rho, reach, box.measured_width_m, is_open, in_threes
-    own = own_score(around, num_points, config)
+    own = own_score(around, num_points, prior)
     return early * own * neighbourhood_score(around, *where, prior, config)[0]
 
 

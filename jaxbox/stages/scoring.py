@@ -223,7 +223,7 @@ def _finish(rows: tuple[Any, ...], reach: jax.Array, clusters: Clusters, config:
         # The paper keeps the height of the cluster itself.
         bottom = take(clusters.low[:, 2], cluster)
         height = take(clusters.high[:, 2], cluster) - bottom
-    total = score * late * own_score(around, take(clusters.num_points, cluster), config)
+    total = score * late * own_score(around, take(clusters.num_points, cluster), prior)
     total = jnp.where(total > config.min_score, total, 0)
     return Candidates(rectangle, bottom, height, total, label, cluster, total > 0, jnp.zeros_like(label))
 
@@ -399,13 +399,13 @@ def _upright_score(
     return config.upright_score + (config.tall_upright_score - config.upright_score) * may_be
 
 
-def own_score(around: NeighbourhoodCounts, num_points: jax.Array, config: VehicleConfig) -> jax.Array:
+def own_score(around: NeighbourhoodCounts, num_points: jax.Array, prior: ClassPrior) -> jax.Array:
     """What boxes count that are filled by other points than those of their cluster: part of a hedge, say.
 
     Args:
       around: see `count_points_around`.
       num_points: (P,) int32, points of the cluster.
-      config: the least share of the points inside that counts in full.
+      prior: fields of (P,) float32: the least share of the points inside that counts in full.
 
     Returns:
       (P,) float32 in [0, 1]: the share of the points inside that are its cluster's, over the least.
@@ -413,7 +413,7 @@ def own_score(around: NeighbourhoodCounts, num_points: jax.Array, config: Vehicl
     Reference: oracle `jaxbox.reference.own_score`.
     """
     own = num_points.astype(jnp.float32) / jnp.maximum(around.num_inside, 1)
-    return jnp.where(own < config.own_share, own / jnp.maximum(config.own_share, own), 1)
+    return jnp.where(own < prior.own_share, own / jnp.maximum(prior.own_share, own), 1)
 
 
 def _nearly_wide(seen_width: jax.Array) -> jax.Array:
