@@ -103,9 +103,9 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
 @jax.jit
 def score_boxes(columns, prior):
     around = NeighbourhoodCounts(jnp.stack(columns["around"], axis=1))
-    seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "rho"))
+    seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "rho", "objective"))
     where = (columns[name] for name in ("rho", "reach", "seen_width", "is_open", "in_threes"))
-    early = scoring.evidence_score(*seen, columns["objective"] + prior.objective_slack, SETTINGS)
+    early = scoring.evidence_score(*seen, SETTINGS)
     own = scoring.own_score(around, columns["num_points"], prior)
     late, top_unseen = scoring.neighbourhood_score(around, *where, prior, SETTINGS)
     by_size = scoring.size_score(columns["length"], columns["width"], prior)
@@ -184,7 +184,7 @@ def test_a_box_that_others_fill_counts_by_the_share_of_its_own_points():
     around = NeighbourhoodCounts(np.stack([inside, *np.zeros((6, 5), np.float32)], axis=1))
     truck = SETTINGS.classes[2]
     own = scoring.own_score(around, np.array([100, 50, 20, 90, 3]), truck)
-    np.testing.assert_allclose(own, [1, 1, 0.4, 1, 1], atol=1e-6)
+    np.testing.assert_allclose(own, [1, 1, 0.5, 1, 1], atol=1e-6)
     no_gate = dataclasses.replace(truck, own_share=0.0)
     np.testing.assert_array_equal(scoring.own_score(around, np.zeros(5, np.int32), no_gate), 1)
 

@@ -71,9 +71,6 @@ class ClassPrior:
     """Share of the free space behind hits that is no evidence against such a vehicle: 1 or more where beams
     pass below the body, 0 where they do not. Where they do, returns from higher up are hits too, see
     ``evidence.raised_hit_max_height_m``."""
-    objective_slack: Scalar
-    """A J that is so much lower is as good: the more of such a vehicle lies off the faces of its box, such as
-    wheels below a body and the gap behind a cab."""
     own_share: Scalar
     """Score x the share of the points in the box that its cluster holds / this, where it holds less: the rest
     of a hedge or a house fills the box of its part. 0 asks for nothing."""
@@ -190,7 +187,6 @@ class Label(enum.IntEnum):
         upright_from_m=1.75,
         past_ends_m=0.0,
         open_below=0.0,
-        objective_slack=0.0,
         own_share=0.0,
         min_open=0.0,
     )
@@ -216,8 +212,7 @@ class Label(enum.IntEnum):
         upright_from_m=10.0,
         past_ends_m=0.0,
         open_below=0.0,
-        objective_slack=0.0,
-        own_share=0.5,
+        own_share=0.4,
         min_open=0.0,
     )
     TRUCK = ClassPrior(
@@ -242,7 +237,6 @@ class Label(enum.IntEnum):
         upright_from_m=10.0,
         past_ends_m=2.0,
         open_below=1.0,
-        objective_slack=0.2,
-        own_share=0.5,
+        own_share=0.4,
         min_open=0.05,
     )

@@ -289,8 +289,7 @@ def early_score(
     if max(box.measured_length_m, box.measured_width_m) < config.min_extent_m:
         return 0.0
     rho = float(np.hypot(box.box[0], box.box[1]))
-    objective = box.objective + float(prior.objective_slack)
-    score = evidence_score(num_points, hit, free_length, support, rho, objective, config)
+    score = evidence_score(num_points, hit, free_length, support, rho, box.objective, config)
     return float(score * size_score(box.box[2:4], prior) * prior.prior_weight)
 
 

@@ -152,8 +152,7 @@ def _early_scores(
             support = rays[1]
         num_points = take(clusters.num_points, cluster)
         rho = jnp.linalg.norm(boxes.center, axis=1)
-        objective = boxes.objective + prior.objective_slack
-        by_evidence = evidence_score(num_points, hit, free_length, support, rho, objective, config)
+        by_evidence = evidence_score(num_points, hit, free_length, support, rho, boxes.objective, config)
         by_size = size_score(boxes.length, boxes.width, prior)
         score = by_evidence * by_size * prior.prior_weight
         large_enough = jnp.max(boxes.measured, axis=1) >= config.min_extent_m
