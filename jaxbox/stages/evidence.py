@@ -199,7 +199,7 @@ def first_returns(evidence: Evidence | None, config: EvidenceConfig) -> jax.Arra
     """
     end = jnp.full(config.num_azimuths, config.num_ranges, jnp.int32)
     if evidence is not None:
-        end = jnp.minimum(next_set(evidence.hit[0, : end.size], jnp.zeros_like(end)), end)
+        end = jnp.minimum(next_set(evidence.low_hit[0], jnp.zeros_like(end)), end)
     return end.astype(jnp.float32) * config.range_cell_m
 
 
@@ -401,7 +401,7 @@ def _classify_rays(
     last = jnp.maximum(cell(leave - FREE_BEFORE_M, 0), first)
     column = azimuth_cell(azimuth, num_azimuths)
     tables = evidence.hit, evidence.free, evidence.free
-    columns = column + jnp.where(raised, num_azimuths, 0), column, column
+    columns = column + raised.astype(jnp.int32) * num_azimuths, column, column
     near_word, first_word, last_word = words_at(tables, (near, first, last), columns)
     met_at = next_set(near_word, near)
     is_hit = crosses & (met_at < cell(jnp.minimum(enter + HIT_AFTER_M, leave + HIT_BEYOND_M), 1))

@@ -65,5 +65,4 @@ def _scattered_azimuths(evidence: Evidence | None) -> jax.Array:
     """() int32: azimuth cells in which a cell of the nearest block was both hit and seen through."""
     if evidence is None:
         return jnp.int32(0)
-    free = evidence.free[0]
-    return count_true(shared_cells(evidence.hit[0, : free.size], free) > 0)
+    return count_true(shared_cells(evidence.low_hit[0], evidence.free[0]) > 0)

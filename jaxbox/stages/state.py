@@ -197,6 +197,11 @@ class Evidence:
     num_ranges: int = dataclasses.field(metadata={"static": True})
     """static, R: range cells of the grid, the last block's being more."""
 
+    @property
+    def low_hit(self) -> jax.Array:
+        """(B, A) uint32: the first columns of `hit`, of returns of vehicle height."""
+        return self.hit[:, : self.free.shape[1]]
+
 
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
