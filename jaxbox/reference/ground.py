@@ -364,13 +364,16 @@ def planes_through_windows(square: np.ndarray) -> tuple[np.ndarray, ...]:
     windows = windows.reshape(*square.shape, -1)
     there = np.isfinite(windows)
     level, rise, rms = np.zeros(square.shape), np.full(square.shape, np.inf), np.zeros(square.shape)
-    for place in zip(*np.nonzero(there.sum(axis=-1) >= MIN_PLANE_POINTS), strict=True):
-        design = np.column_stack([x, y, np.ones_like(x)])[there[place]]
-        fit, _, rank, _ = np.linalg.lstsq(design, windows[place][there[place]], rcond=None)
-        if rank == MIN_PLANE_POINTS:
-            level[place], rise[place] = fit[2], np.hypot(*fit[:2])
-            rms[place] = np.sqrt(np.mean((design @ fit - windows[place][there[place]]) ** 2))
-    return there.sum(axis=-1), level, rise, rms
+    num = there.sum(axis=-1)
+    design = np.stack([x, y, np.ones_like(x)], axis=1).astype(np.float64)
+    normal = np.einsum("xyk,ki,kj->xyij", there, design, design, optimize=True)
+    spans = np.linalg.matrix_rank(normal, hermitian=True) == MIN_PLANE_POINTS
+    value = np.where(there, windows, 0.0)[spans]
+    fit = np.linalg.solve(normal[spans], (value @ design)[..., None])[..., 0]
+    error = (fit @ design.T - value) * there[spans]
+    level[spans], rise[spans] = fit[:, 2], np.hypot(fit[:, 0], fit[:, 1])
+    rms[spans] = np.sqrt((error**2).sum(axis=-1) / num[spans])
+    return num, level, rise, rms
 
 
 def _lower_envelope(lowest: np.ndarray, *, step: float, num_rounds: int) -> np.ndarray:
@@ -379,9 +382,7 @@ def _lower_envelope(lowest: np.ndarray, *, step: float, num_rounds: int) -> np.n
     rise = np.array([[far, step, far], [step, 0.0, step], [far, step, far]])
     envelope = lowest
     for _ in range(num_rounds):
-        padded = np.pad(envelope, 1, constant_values=np.inf)
-        windows = np.lib.stride_tricks.sliding_window_view(padded, (3, 3))
-        envelope = (windows + rise).min(axis=(2, 3))
+        envelope = ndimage.grey_erosion(envelope, structure=-rise, mode="constant", cval=np.inf)
     return envelope
 
 
