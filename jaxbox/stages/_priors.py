@@ -22,10 +22,12 @@ def prior_of(classes: Sequence[ClassPrior], label: jax.Array) -> ClassPrior:
       Fields of (P,) float32.
     """
 
+    is_other = [label == i for i in range(1, len(classes))]
+
     def choose(*values: jax.Array | float) -> jax.Array:
         chosen, *others = (jnp.asarray(value, jnp.float32) for value in values)
-        for i, other in enumerate(others, start=1):
-            chosen = jnp.where(label == i, other, chosen)
+        for is_this, value in zip(is_other, others, strict=True):
+            chosen = jnp.where(is_this, value, chosen)
         return jnp.broadcast_to(chosen, label.shape)
 
     return jax.tree.map(choose, *classes)
