@@ -168,7 +168,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         metavar="FOLDER",
         help="labelled sets, pooled",
     )
-    parser.add_argument("--draws", type=int, default=100, help="draws of the bootstrap over drives")
+    parser.add_argument(
+        "--draws", type=common.at_least(1), default=100, help="draws of the bootstrap over drives"
+    )
     parser.add_argument(
         "--drives", type=pathlib.Path, metavar="FILE", help='a table by drive too; one "frame drive" a line'
     )

@@ -146,8 +146,8 @@ def measure(config: DetectorConfig, sweeps: int, repeats: int) -> dict[str, Any]
 def main(arguments: Sequence[str] | None = None) -> None:
     """Prints the figures and writes the report."""
     parser = common.parser(__doc__ or "", quick=f"{QUICK_SWEEPS} sweeps, once")
-    parser.add_argument("--sweeps", type=int, default=SWEEPS)
-    parser.add_argument("--repeats", type=int, default=REPEATS)
+    parser.add_argument("--sweeps", type=common.at_least(1), default=SWEEPS)
+    parser.add_argument("--repeats", type=common.at_least(1), default=REPEATS)
     options: argparse.Namespace = parser.parse_args(arguments)
     config = common.chosen_config(options)
     sweeps, repeats = (QUICK_SWEEPS, 1) if options.quick else (options.sweeps, options.repeats)

@@ -109,11 +109,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = common.parser(__doc__ or "")
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument(
-        "--batch", type=int, default=0, help="sweeps of a jax.vmap; by default a single sweep"
+        "--batch", type=common.at_least(0), default=0, help="sweeps of a jax.vmap; by default a single sweep"
     )
     parser.add_argument(
         "--sweeps",
-        type=int,
+        type=common.at_least(0),
         default=SWEEPS,
         help="real sweeps that turns are counted on; 0: loops count once",
     )

@@ -99,7 +99,7 @@ def program_memory(config: DetectorConfig) -> dict[str, float]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Prints the figures and writes the report."""
     parser = common.parser(__doc__ or "", quick=f"{QUICK_FRAMES} frames")
-    parser.add_argument("--frames", type=int, default=FRAMES)
+    parser.add_argument("--frames", type=common.at_least(1), default=FRAMES)
     options: argparse.Namespace = parser.parse_args(arguments)
     if options.set:
         raise SystemExit("--set: the command line is measured with a preset as it is.")

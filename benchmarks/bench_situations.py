@@ -83,8 +83,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     groups = list(dict.fromkeys(situation.group for situation in SITUATIONS))
     parser = common.parser(__doc__ or "")
     parser.add_argument("--only", nargs="+", choices=groups, default=groups, help="these groups")
-    parser.add_argument("--draws", type=int, default=0, help="of places aside; 0 for the place of the table")
-    parser.add_argument("--seed", type=int, default=0, help="of the draws")
+    parser.add_argument(
+        "--draws", type=common.at_least(0), default=0, help="of places aside; 0: the table's own"
+    )
+    parser.add_argument("--seed", type=common.at_least(0), default=0, help="of the draws")
     options = parser.parse_args(arguments)
     config = common.chosen_config(options)
 

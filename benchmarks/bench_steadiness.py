@@ -147,7 +147,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Prints the table, and writes the report."""
     parser = common.parser(__doc__ or "", quick="four sweeps and one draw, eight sweeps a sequence")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
-    parser.add_argument("--draws", type=int, default=10, help="changed copies of a sweep and a change")
+    parser.add_argument(
+        "--draws", type=common.at_least(1), default=10, help="changed copies of a sweep and a change"
+    )
     parser.add_argument("--lost", action="store_true", help="print boxes from score .3 on that do not stay")
     options = parser.parse_args(arguments)
     config = common.chosen_config(options)

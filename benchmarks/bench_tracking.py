@@ -400,7 +400,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = common.parser(__doc__ or "")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument("--poses", choices=["kiss-icp", "boxes", "none"], help="of the real drives, not oxts")
-    parser.add_argument("--sweeps", type=int, default=100, help="of each ray-cast drive")
+    parser.add_argument("--sweeps", type=common.at_least(2), default=100, help="of each ray-cast drive")
     options: argparse.Namespace = parser.parse_args(arguments)
     config = common.chosen_config(options)
     found: dict[str, Any] = {}

@@ -73,6 +73,17 @@ def parser(description: str, *, preset: bool = True, quick: str | None = None) -
     return options
 
 
+def at_least(least: int) -> Callable[[str], int]:
+    """Type of an option: whole numbers from the least on."""
+
+    def number(text: str) -> int:
+        if not text.removeprefix("-").isdecimal() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"{text!r} is no whole number from {least} on")
+        return int(text)
+
+    return number
+
+
 def enable_cache() -> None:
     """Switches JAX's compilation cache on, without jaxbox's traced programs: `detect` is one function."""
     folder = cache_folder(os.environ)

@@ -331,7 +331,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     presets = sorted(DetectorConfig.presets())
     parser.add_argument("--digests-of", choices=[*presets, TRACKS], help=argparse.SUPPRESS)
     parser.add_argument("--presets", nargs="+", choices=presets, default=PRESETS)
-    parser.add_argument("--keys", type=int, help=f"random keys to try, {KEYS} by default")
+    parser.add_argument("--keys", type=common.at_least(1), help=f"random keys to try, {KEYS} by default")
     options: argparse.Namespace = parser.parse_args(arguments)
     if options.digests_of:
         _print_digests(options)

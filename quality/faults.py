@@ -169,8 +169,8 @@ def kill_and_resume(sweeps: pathlib.Path, root: pathlib.Path, *, kills: int, see
 def main() -> None:
     """Prints what happened; ends with 1 where results differ or a file was broken."""
     options = argparse.ArgumentParser(description="A killed and resumed jaxbox detect.")
-    options.add_argument("--kills", type=int, default=KILLS)
-    options.add_argument("--sweeps", type=int, default=SWEEPS)
+    options.add_argument("--kills", type=common.at_least(1), default=KILLS)
+    options.add_argument("--sweeps", type=common.at_least(1), default=SWEEPS)
     options.add_argument("--seed", type=int, default=0, help="of the moments of the kills")
     options.add_argument("--json", type=pathlib.Path, help="also write the report to this file")
     chosen = options.parse_args()

@@ -228,7 +228,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     short = {pathlib.PurePath(module).stem: module for module in TESTS}
     parser.add_argument("--modules", nargs="+", choices=sorted(short), default=list(short))
-    parser.add_argument("--sample", type=int, help="mutants of each module; all without")
+    parser.add_argument("--sample", type=common.at_least(1), help="mutants of each module; all without")
     parser.add_argument(
         "--again", type=pathlib.Path, help="a report whose survivors are run again, and no others"
     )

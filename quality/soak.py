@@ -229,8 +229,12 @@ def _cycle(sweeps: Sequence[Any], frames: int) -> Iterator[Any]:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Prints the figures and writes the report."""
     parser = common.parser(__doc__ or "", quick=f"{QUICK_FRAMES} small synthetic frames, which need no data")
-    parser.add_argument("--frames", type=int, help=f"of real sweeps and of drives, {FRAMES:,} by default")
-    parser.add_argument("--size-frames", type=int, help=f"of varying size, {SIZE_FRAMES:,} by default")
+    parser.add_argument(
+        "--frames", type=common.at_least(1), help=f"of real sweeps and of drives, {FRAMES:,} by default"
+    )
+    parser.add_argument(
+        "--size-frames", type=common.at_least(1), help=f"of varying size, {SIZE_FRAMES:,} by default"
+    )
     options: argparse.Namespace = parser.parse_args(arguments)
     options.frames = options.frames or (QUICK_FRAMES if options.quick else FRAMES)
     options.size_frames = options.size_frames or (QUICK_FRAMES if options.quick else SIZE_FRAMES)

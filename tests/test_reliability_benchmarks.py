@@ -9,7 +9,7 @@ import tomllib
 import numpy as np
 import pytest
 
-from benchmarks import bench_corruption
+from benchmarks import bench_corruption, common
 from jaxbox import synthetic
 from jaxbox.evaluation.copies import Frame
 from jaxbox.evaluation.corruptions import CORRUPTIONS
@@ -23,6 +23,18 @@ RESULTS = pathlib.Path(__file__).parents[1] / "benchmarks" / "results"
 def frame():
     sweep = synthetic.make_sweep(0, num_azimuths=100)
     return Frame("000000", sweep.xyz, sweep.intensity, sweep.calibration, [])
+
+
+@pytest.mark.parametrize(
+    ("text", "least"), [("0", 1), ("-1", 0), ("1.5", 1), ("many", 1), ("--1", 0), ("", 0)]
+)
+def test_an_option_below_its_least_number_is_named(text, least, capsys):
+    parser = common.parser("")
+    parser.add_argument("--draws", type=common.at_least(least))
+    with pytest.raises(SystemExit, match="2"):
+        parser.parse_args([f"--draws={text}"])
+    assert f"--draws: {text!r} is no whole number from {least} on" in capsys.readouterr().err
+    assert parser.parse_args([f"--draws={least}"]).draws == least
 
 
 @pytest.mark.parametrize("name", sorted(CORRUPTIONS))

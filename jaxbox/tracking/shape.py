@@ -201,7 +201,8 @@ def refine_boxes(slots: Slots, seen: Observations) -> tuple[jax.Array, jax.Array
     """
     crossed = is_crossed(seen.yaw, slots.yaw)[:, None]
     flat = jnp.where(crossed, seen.size[:, 1::-1], seen.size[:, :2])
-    length, width = track_size(slots)[:, 0], track_size(slots)[:, 1]
+    size = track_size(slots)
+    length, width = size[:, 0], size[:, 1]
     is_seen = ~crossed[:, 0] & (seen.extent[:, 0] > SEEN_SHARE * length)
     # The length of a box that lies across the track is not its width.
     sides = jnp.where(is_seen, flat[:, 0], length), jnp.where(crossed[:, 0], width, flat[:, 1])
