@@ -103,6 +103,11 @@ def pytest_collection_finish() -> None:
     gc.set_threshold(*GC_THRESHOLDS)
 
 
+def pytest_unconfigure() -> None:
+    """Gives it all back: nanobind, which JAX is bound by, complains of what is left when Python ends."""
+    gc.unfreeze()
+
+
 def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
     """Between two files, forgets the compiled programs when they take up many memory maps.
 
