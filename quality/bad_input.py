@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from jaxbox import DEFAULT_SCORE_THRESHOLD, Detections, DetectorConfig, Label, PointCloud, Status, synthetic
+from jaxbox.evaluation import count_points_in_boxes
 
 CAPACITY = 2**14
 """The smallest bucket, unless a case names another."""
@@ -76,18 +77,13 @@ def box_support(detections: Detections, xyz: np.ndarray, config: DetectorConfig)
     Returns:
       (K,) int64, of the valid boxes.
     """
-    xyz = np.asarray(xyz, np.float64)
-    xyz = xyz[np.isfinite(xyz).all(axis=1)]
-    margin_m, grade = float(config.vehicles.margin_m), float(config.vehicles.top_grade)
-    held = []
-    for row in np.flatnonzero(detections.valid):
-        x, y, z = (xyz - np.asarray(detections.center[row], np.float64)).T
-        cos, sin = np.cos(float(detections.yaw[row])), np.sin(float(detections.yaw[row]))
-        local = np.column_stack([x * cos + y * sin, y * cos - x * sin, z])
-        spacing_m = grade * np.hypot(*np.asarray(detections.center[row], np.float64)[:2])
-        outside = np.abs(local) - detections.size[row] / 2
-        held.append((outside <= (margin_m, margin_m, margin_m + spacing_m)).all(axis=1).sum())
-    return np.array(held, int)
+    center, size, yaw = (
+        np.asarray(of_all, np.float64)[detections.valid]
+        for of_all in (detections.center, detections.size, detections.yaw)
+    )
+    margin_m = np.full_like(size, config.vehicles.margin_m)
+    margin_m[:, 2] += float(config.vehicles.top_grade) * np.hypot(center[:, 0], center[:, 1])
+    return count_points_in_boxes(xyz, center, size + 2 * margin_m, yaw)
 
 
 def broken_laws(detections: Detections, xyz: np.ndarray, capacity: int, config: DetectorConfig) -> list[str]:
