@@ -86,14 +86,21 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Marks the fast tests, and has them follow the file whose program nearly all others take.
 
-    With `-n 2` one process compiles it while the other goes through the fast tests: else both would.
+    With `-n 2` one process compiles it while the other goes through the fast tests: else both would. Those of
+    the toolbox, which are long, come next: of two processes the last file keeps but one busy.
     """
-    items.sort(key=lambda item: (item.path.name != FIRST, item.path.name not in FAST))
+    items.sort(
+        key=lambda item: (item.path.name != FIRST, item.path.name not in FAST, not _is_of_toolbox(item))
+    )
     for item in items:
         # Doctests have no fixtures.
         names = {getattr(item, "originalname", item.name), *getattr(item, "fixturenames", ())}
         if item.path.name in FAST and not names & COMPILING and not item.get_closest_marker("slow"):
             item.add_marker(pytest.mark.fast)
+
+
+def _is_of_toolbox(item: pytest.Item) -> bool:
+    return item.path.name.startswith("test_xla")
 
 
 def pytest_collection_finish() -> None:

@@ -7,7 +7,7 @@ import sys
 
 import jax
 import pytest
-from test_detector import CAPACITY, assert_same_bits, found, street
+from test_detector import CAPACITY, assert_same_bits, street
 from typer.testing import CliRunner
 
 import jaxbox
@@ -116,16 +116,17 @@ def test_the_command_line_says_in_one_line_why_nothing_is_kept(tmp_path, monkeyp
 
 
 def test_detect_goes_through_what_is_kept_and_counts_it(tmp_path):
-    cloud = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY)
-    expected = found(0)
+    cloud, paper = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY), jaxbox.DetectorConfig.paper()
+    expected = jax.device_get(jaxbox.detect(cloud, paper))
     before = count_compilations()
     jaxbox.enable_cache(tmp_path)
     for _ in range(2):
-        assert_same_bits(jaxbox.detect(cloud), expected)
+        assert_same_bits(jaxbox.detect(cloud, paper), expected)
         assert count_compilations() == before + 1
     assert len(list((tmp_path / cache.PROGRAMS).iterdir())) == len(programs.Half)
-    assert_same_bits(jaxbox.detect_batch([cloud, cloud], devices=jax.devices()[:1])[1], expected)
-    jax.eval_shape(jax.vmap(jaxbox.detect), jaxbox.stack_clouds([cloud, cloud]))
+    batch = jaxbox.detect_batch([cloud, cloud], paper, devices=jax.devices()[:1])
+    assert_same_bits(batch[1], expected)
+    jax.eval_shape(jax.vmap(jaxbox.detect, (0, None)), jaxbox.stack_clouds([cloud, cloud]), paper)
     assert count_compilations() == before + 1
     blind = replace_fields(jaxbox.DetectorConfig(), {"evidence.enabled": False})
     with pytest.raises(ValueError, match=r"evidence\.enabled"):

@@ -180,7 +180,7 @@ def whole_clusters(size=60):
 @pytest.mark.usefixtures("platform")
 def test_hulls_of_whole_numbers_are_exact_and_begin_at_the_leftmost_point():
     points, valid = whole_clusters()
-    vertices, num = trace(points.astype(np.float32), valid)
+    vertices, num = map(np.asarray, trace(points.astype(np.float32), valid))
     for xy, ours, count in zip(
         [p[v] for p, v in zip(points, valid, strict=True)], vertices, num, strict=True
     ):

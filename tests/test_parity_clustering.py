@@ -45,6 +45,7 @@ def with_room(config, sizes):
     return dataclasses.replace(config, maps=tuple(ComponentMap(max_clusters=size) for size in sizes))
 
 
+find_statistics = parity.PerForm(clustering.find_statistics, static_argnames="max_components")
 sampling_rank = parity.PerForm(clustering.sampling_rank)
 sampled_share = parity.PerForm(clustering.sampled_share, static_argnames="max_points")
 list_points = parity.PerForm(ragged.list_points, static_argnames=("num_clusters", "max_points"))
@@ -74,7 +75,7 @@ def test_statistics_are_those_of_the_first_points_on_every_platform(num_points):
     component[1] += 40
     xyz, in_slab = rng.normal(size=(1000, 3)).astype(np.float32), rng.random(1000) < 0.5
     points = component, jnp.int32(num_points), xyz[:, :2], xyz[:, 2], in_slab
-    statistics = clustering.find_statistics(*map(jnp.asarray, points), max_components=81)
+    statistics = jax.device_get(find_statistics(*points, max_components=81))
     for i in range(81):
         member = (component == i)[:, :num_points].any(axis=0)
         own = xyz[:num_points][member]
@@ -349,8 +350,9 @@ def test_fitted_points_are_exactly_those_of_the_reference(cases):
         few = few < np.maximum(settings.min_slab_points, share * size)
         used = (case.slot >= 0) & (in_slab | few[case.slot])
         xy, z = np.split(case.obstacles.xyz.astype(np.float32), [2], axis=1)
-        rank = np.asarray(sampling_rank(xy, z[:, 0]))
-        num = np.bincount(case.slot[used], minlength=len(case.proposals)).astype(np.int32)
+        places = (parity.pad(values, parity.MAX_OBSTACLES) for values in (xy, z[:, 0]))
+        rank = np.asarray(sampling_rank(*places))[: len(xy)]
+        num = np.bincount(case.slot[used], minlength=parity.MAX_CLUSTERS).astype(np.int32)
         used &= rank < np.asarray(sampled_share(num, max_points=settings.max_points))[case.slot]
         rows = np.flatnonzero(used)
         lists = list_points(

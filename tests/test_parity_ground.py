@@ -176,7 +176,7 @@ def test_heights_are_those_of_the_reference_on_one_plane_and_on_two(cases):
 def test_what_rounding_puts_past_the_last_cell_is_no_minimum_of_another():
     xyz = np.tile(np.array([[2.1, 0, -9]], np.float32), (8, 1))
     config = dataclasses.replace(GROUND, candidate_half_x_m=2.2, candidate_half_y_m=2.2)
-    _, occupied = ground.cell_minima(xyz, np.ones(8, bool), config)
+    _, occupied = jax.jit(lambda *points: ground.cell_minima(*points, config))(xyz, np.ones(8, bool))
     assert not occupied.any()
 
 

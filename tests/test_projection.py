@@ -222,7 +222,7 @@ def test_eager_jit_and_vmap_agree():
     eager: ProjectedBoxes = project_boxes(*boxes, calibration)
     jitted = _project(*boxes, calibration)
     batch = jax.tree.map(lambda array: array.reshape(2, 4, *array.shape[1:]), boxes)
-    mapped = jax.vmap(project_boxes, in_axes=(0, 0, 0, None))(*batch, calibration)
+    mapped = jax.vmap(_project, in_axes=(0, 0, 0, None))(*batch, calibration)
     for other in (jitted, jax.tree.map(lambda array: array.reshape(8, *array.shape[2:]), mapped)):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=0.05), eager, other)
 

@@ -59,6 +59,10 @@ def test_the_polynomials_are_as_close_as_they_say(coefficients, function, end, b
 
 # Bits.
 
+pack_bits = jax.jit(bits.pack_bits, static_argnames="axis")
+count_bits = jax.jit(bits.count_bits)
+lowest_bit = jax.jit(bits.lowest_bit)
+
 
 @pytest.mark.parametrize("shape", [(1,), (31,), (32,), (33,), (3, 70, 2), (64, 5)])
 def test_packed_bits_are_the_flags_and_count_and_begin_as_those_do(shape):
@@ -67,27 +71,27 @@ def test_packed_bits_are_the_flags_and_count_and_begin_as_those_do(shape):
         moved = np.moveaxis(flags, axis, -1)
         moved = np.pad(moved, [(0, 0)] * (flags.ndim - 1) + [(0, -moved.shape[-1] % 32)])
         moved = moved.reshape(*moved.shape[:-1], -1, 32)
-        words = jnp.moveaxis(bits.pack_bits(jnp.asarray(flags), axis=axis), axis, -1)
-        assert words.dtype == jnp.uint32
-        np.testing.assert_array_equal((np.asarray(words)[..., None] >> np.arange(32)) & 1, moved)
-        np.testing.assert_array_equal(bits.count_bits(words), moved.sum(axis=-1))
+        words = np.moveaxis(np.asarray(pack_bits(flags, axis=axis)), axis, -1)
+        assert words.dtype == np.uint32
+        np.testing.assert_array_equal((words[..., None] >> np.arange(32)) & 1, moved)
+        np.testing.assert_array_equal(count_bits(words), moved.sum(axis=-1))
         some = moved.any(axis=-1)
-        np.testing.assert_array_equal(bits.lowest_bit(words)[some], moved.argmax(axis=-1)[some])
-    np.testing.assert_array_equal(bits.pack_bits(flags.astype(np.uint8)), bits.pack_bits(flags))
+        np.testing.assert_array_equal(lowest_bit(words)[some], moved.argmax(axis=-1)[some])
+    np.testing.assert_array_equal(pack_bits(flags.astype(np.uint8)), pack_bits(flags))
 
 
 @pytest.mark.parametrize("num_flags", [1, 16, 32])
 def test_joined_bits_are_those_that_are_packed(num_flags):
     flags = np.random.default_rng(num_flags).random((num_flags, 3, 5)) < 0.5
-    joined = bits.join_bits(list(jnp.asarray(flags)))
-    np.testing.assert_array_equal(joined, bits.pack_bits(jnp.asarray(flags), axis=0)[0])
+    joined = jax.jit(bits.join_bits)(list(flags))
+    np.testing.assert_array_equal(joined, pack_bits(flags, axis=0)[0])
 
 
 def test_every_bit_of_a_word_can_be_the_lowest_or_the_only_one():
     place = np.arange(32, dtype=np.uint32)
     for words in (np.uint32(1) << place, np.uint32(2**32 - 1) << place):
-        np.testing.assert_array_equal(bits.lowest_bit(words), place)
-    assert bits.count_bits(np.array([0, 1, 2**31, 2**32 - 1], np.uint32)).tolist() == [0, 1, 1, 32]
+        np.testing.assert_array_equal(lowest_bit(words), place)
+    assert count_bits(np.array([0, 1, 2**31, 2**32 - 1], np.uint32)).tolist() == [0, 1, 1, 32]
 
 
 # Hashing.

@@ -16,6 +16,10 @@ SIZES = (1, 2, BLOCK - 1, BLOCK, BLOCK + 1, 3 * BLOCK + 7)
 
 # Compiled whole: run step by step, each step of each size would compile alone.
 compact = parity.PerForm(rows.compact, static_argnums=1)
+compact_sequential = jax.jit(rows._compact_sequential, static_argnums=2)
+compact_parallel = jax.jit(rows._compact_parallel, static_argnums=1)
+running_sum = jax.jit(rows.running_sum, static_argnums=1)
+count_each = jax.jit(rows.count_each)
 
 
 @pytest.mark.usefixtures("platform")
@@ -36,7 +40,7 @@ def test_prefix_sum_and_prefix_max_are_those_of_numpy_on_every_platform(size):
 def test_running_sums_are_those_of_numpy_along_either_axis(dtype, size):
     values = np.random.default_rng(size).integers(0, 9, (size, 3)).astype(dtype)
     for axis in (0, 1):
-        total = rows.running_sum(jnp.asarray(values), axis)
+        total = running_sum(values, axis)
         assert total.dtype == dtype
         np.testing.assert_array_equal(total, np.cumsum(values, axis=axis))
     batch = jax.vmap(functools.partial(rows.running_sum, axis=0))(jnp.asarray(values))
@@ -110,8 +114,8 @@ def test_compact_goes_through_rows_as_far_as_they_count_on_every_platform(size):
 def test_both_ways_to_compact_give_the_same(share, capacity):
     for size in (1, 31, 32, 1000):
         mask = jnp.asarray(np.random.default_rng(size).random(size) < share)
-        one = rows._compact_sequential(mask[None], jnp.int32(size), capacity)
-        other = rows._compact_parallel(mask, capacity)
+        one = compact_sequential(mask[None], jnp.int32(size), capacity)
+        other = compact_parallel(mask, capacity)
         np.testing.assert_array_equal(one[0], other[0])
         assert int(one[1]) == int(other[1]) == int(mask.sum())
 
@@ -155,13 +159,13 @@ def test_split_index_is_divmod(size):
 def test_count_each_counts_every_mask_also_where_all_are_true(size):
     rng = np.random.default_rng(size)
     masks = [rng.random(size) < density for density in (0.0, 0.2, 1.0, 1.0, 0.7)]
-    assert rows.count_each(*map(jnp.asarray, masks)).tolist() == [mask.sum() for mask in masks]
+    assert count_each(*masks).tolist() == [mask.sum() for mask in masks]
 
 
 def test_count_each_takes_any_number_of_masks_of_any_sizes():
     masks = [np.arange(size) % 3 == 0 for size in (1, 32, 33, 1000, 2, 64, 31)]
     for num in range(1, 8):
-        counts = rows.count_each(*map(jnp.asarray, masks[:num]))
+        counts = count_each(*masks[:num])
         assert counts.dtype == jnp.int32
         assert counts.tolist() == [mask.sum() for mask in masks[:num]]
 
