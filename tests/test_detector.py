@@ -459,7 +459,7 @@ def test_the_ground_is_the_streets():
 
 def test_vehicles_are_found_where_the_ground_returns_nothing():
     sweep = synthetic.no_ground_sweep()
-    detections = run(sweep.xyz[::4], capacity=2 * CAPACITY)
+    detections = run(sweep.xyz[::4], capacity=8 * CAPACITY)
     assert rectangles(detections, GOOD_SCORE).shape[0] > 0
 
 
