@@ -176,8 +176,8 @@ def test_the_same_key_gives_the_same_bits_and_none_is_key_zero():
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_eight_times_the_padding_gives_the_same_boxes_bit_for_bit(seed):
-    wide, narrow = run(street(seed).xyz, capacity=8 * CAPACITY), found(seed)
+def test_twice_the_padding_gives_the_same_boxes_bit_for_bit(seed):
+    wide, narrow = run(street(seed).xyz, capacity=2 * CAPACITY), found(seed)
     for name in (
         "center",
         "size",
@@ -193,13 +193,9 @@ def test_eight_times_the_padding_gives_the_same_boxes_bit_for_bit(seed):
         assert_same_bits(getattr(wide, name), getattr(narrow, name))
     for name in ("ground_mask", "point_component", "point_detection"):
         np.testing.assert_array_equal(getattr(wide, name)[:CAPACITY], getattr(narrow, name))
-    # The extremes of a hull are compared in fewer bits where there are more points: each reaches as far, but
-    # for a slice.
+    # The extremes of a hull are compared in fewer bits where there are more points: a slice wide.
     slice_m = narrow.size[:, :1].max() / DetectorConfig().hull.num_slices
-    angle = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-    directions = np.stack([np.cos(angle), np.sin(angle)])
-    reach, expected = ((d.hulls.vertices @ directions).max(axis=1) for d in (wide, narrow))
-    np.testing.assert_allclose(reach, expected, atol=slice_m)
+    np.testing.assert_allclose(wide.hulls.vertices, narrow.hulls.vertices, atol=slice_m)
 
 
 def test_a_batch_of_sweeps_thresholds_and_keys_gives_the_bits_of_the_singles():
@@ -280,9 +276,7 @@ def test_only_an_accelerator_takes_a_batch_at_once_and_not_where_scatters_are_or
 def test_assignments_beyond_their_capacity_are_counted_and_the_largest_clusters_are_kept():
     full, few = found(0), 24
     completion = dataclasses.replace(DetectorConfig().completion, max_assignments=few)
-    cloud = PointCloud.from_numpy(street(0).xyz, capacity=CAPACITY)
-    config = dataclasses.replace(DetectorConfig(), completion=completion)
-    cut = parity.detect_quickly(cloud, config).on_host()
+    cut = run(street(0).xyz, config=dataclasses.replace(DetectorConfig(), completion=completion))
     needed = int(full.counts.assignments)
     assert int(full.status) == 0
     assert few < needed == int(cut.counts.assignments) < DetectorConfig().completion.max_assignments
@@ -290,10 +284,9 @@ def test_assignments_beyond_their_capacity_are_counted_and_the_largest_clusters_
     with pytest.raises(RuntimeError, match=rf"completion\.max_assignments must be at least {needed}\."):
         cut.raise_if_failed()
     # Boxes that are still found are those of before, and none of them has fewer points than one that is lost.
-    # Compiled otherwise, they are rounded otherwise.
+    again = {tuple(box) for box in rectangles(cut).tolist()}
     points = np.array(full.num_points[full.valid])
-    differ = np.abs(rectangles(full)[:, None] - rectangles(cut))
-    kept = (differ < 1e-3).all(axis=2).any(axis=1)
+    kept = np.array([tuple(box) in again for box in rectangles(full).tolist()])
     assert 0 < kept.sum() < len(kept)
     assert points[kept].min() > np.median(points[~kept])
 
@@ -459,7 +452,7 @@ def test_the_ground_is_the_streets():
 
 def test_vehicles_are_found_where_the_ground_returns_nothing():
     sweep = synthetic.no_ground_sweep()
-    detections = run(sweep.xyz[::4], capacity=8 * CAPACITY)
+    detections = run(sweep.xyz[::4], capacity=2 * CAPACITY)
     assert rectangles(detections, GOOD_SCORE).shape[0] > 0
 
 
