@@ -113,9 +113,9 @@ def score_boxes(columns, prior):
 
 
 @jax.jit
-def end_where_seen(boxes, columns, usual_m):
+def end_where_seen(boxes, columns, prior):
     around = NeighbourhoodCounts(columns)
-    return scoring.end_where_seen(boxes, around, usual_m, parity.CONFIG.completion, 0.004)
+    return scoring.end_where_seen(boxes, around, prior, parity.CONFIG.completion, 0.004)
 
 
 def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
@@ -206,19 +206,22 @@ def test_free_space_below_a_body_counts_as_in_the_reference():
 
 def test_far_ends_are_where_the_reference_sees_them():
     rng = np.random.default_rng(0)
-    usual_m = rng.choice([3.9, 4.98, 8.5], MAX_BOXES)
-    size = np.column_stack([usual_m * rng.uniform(0.8, 1.3, MAX_BOXES), rng.uniform(1, 2.5, MAX_BOXES)])
+    label = rng.integers(0, 3, MAX_BOXES)
+    prior = jax.tree.map(lambda *values: np.array(values, np.float32)[label], *SETTINGS.classes)
+    size = np.column_stack(
+        [prior.length_m * rng.uniform(0.8, 1.3, MAX_BOXES), rng.uniform(1, 2.5, MAX_BOXES)]
+    )
     place = rng.uniform([-60, -60], 60, (MAX_BOXES, 2)) * rng.choice([0.02, 0.2, 1], (MAX_BOXES, 1))
     boxes = np.column_stack([place, size, rng.uniform(-4, 4, MAX_BOXES)]).astype(np.float32)
     columns = np.zeros((MAX_BOXES, 7), np.float32)
     columns[:, 0], columns[:, 6] = rng.integers(0, 500, MAX_BOXES), size[:, 0] * rng.uniform(0, 1, MAX_BOXES)
     rule, beam_angle = parity.CONFIG.completion, 0.004
-    ours, sure = end_where_seen(boxes, columns, usual_m.astype(np.float32))
+    ours, sure = end_where_seen(boxes, columns, prior)
     answers = [
         reference.end_where_seen(
             box,
             reference.NeighbourhoodCounts(columns[row, 0], 1.5, 0, 0, deepest=float(columns[row, 6])),
-            usual_m[row],
+            SETTINGS.classes[label[row]],
             rule,
             beam_angle,
         )

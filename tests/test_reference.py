@@ -611,7 +611,7 @@ def test_extents_grow_away_from_the_sensor_towards_it_or_both_ways(sign):
 
 
 def test_a_side_that_may_be_hidden_has_the_usual_size_and_one_seen_whole_nears_the_measured():
-    prior = dataclasses.replace(CAR, length_m=4.0)
+    prior = dataclasses.replace(CAR, length_m=4.0, whole_from_m=4.0)
     rule = dataclasses.replace(COMPLETION, length_margin_m=0.3, seen_length=0.7, seen_weight=0.8)
 
     def likely_length(measured_m, config=rule):
@@ -624,6 +624,25 @@ def test_a_side_that_may_be_hidden_has_the_usual_size_and_one_seen_whole_nears_t
     assert all(likely_length(m) >= m for m in measured)
     unweighed = [likely_length(m, dataclasses.replace(rule, seen_weight=0.0)) for m in measured]
     np.testing.assert_allclose(unweighed, np.maximum(measured, 4))
+
+
+def test_where_lengths_differ_a_vehicle_may_be_as_long_as_it_is_seen():
+    prior = dataclasses.replace(CAR, length_m=8.0, whole_from_m=4.0, max_length_m=18.0)
+    rule = dataclasses.replace(COMPLETION, length_margin_m=0.3, seen_length=0.7, seen_weight=0.8)
+
+    def lengths(measured_m):
+        sides = reference.Assignment((3.0, 3.0 + measured_m), (3.0, 4.0), 0.0)
+        judged = reference.place_widths(sides, prior)
+        assert np.ptp(judged[:, 2]) == 0
+        return judged[0, 2], reference.likely_sizes(sides, prior, rule)[0]
+
+    # Between 4 and 4.4 m it goes from hidden in part to seen whole.
+    for measured_m, judged, answered in ((3.9, 8, 8), (4.2, 6.1, 8 - 0.4 * 3.5), (5, 5, 8 - 0.8 * 2.7)):
+        np.testing.assert_allclose(lengths(measured_m), (judged, answered))
+    np.testing.assert_allclose(lengths(9.0)[0], 9)
+    usual = dataclasses.replace(prior, whole_from_m=8.0)
+    sides = reference.Assignment((3.0, 9.0), (3.0, 4.0), 0.0)
+    assert reference.place_widths(sides, usual)[0, 2] == 8
 
 
 def test_a_width_has_limits_of_its_own():
@@ -683,7 +702,7 @@ def test_the_chosen_hypothesis_has_the_objective_that_its_parts_add_up_to():
     xy = xyz[(height > 0.2) & (height < 0.8) & (xyz[:, 0] > 10), :2]
     curve, _ = reference.try_rotations(xy, BOX)
     weights = {"free_weight": 0.7, "free_length_weight": 3.0, "inside_weight": 0.4, "near_weight": 0.9}
-    prior = dataclasses.replace(CAR, length_m=6.0, width_m=2.2)
+    prior = dataclasses.replace(CAR, length_m=6.0, whole_from_m=6.0, width_m=2.2)
     boxes = {}
     for cost in (-9.0, 9.0):
         changes = weights | {"closeness_weight": 1.3, "not_away_cost": cost}
@@ -757,7 +776,7 @@ def test_points_round_a_box_are_shared_out_by_margin_ring_and_height():
 def test_the_ring_of_a_long_vehicle_reaches_farther_past_its_ends_but_not_its_sides():
     # From the middle of the side neither end is hidden.
     box = np.array([0.0, 10.0, 8.0, 2.0, 0.0])
-    xyz = np.array([[0, 10, 0], [6.4, 10.5, 0], [-6.4, 8.6, 0], [6.6, 10, 0], [0, 8.4, 0.0]])
+    xyz = np.array([[0, 10, 0], [6.4, 10.5, 0], [-6.4, 8.6, 0], [6.6, 10, 0], [0, 11.6, 0.0]])
     for past_ends_m, num_ring in ((0, 0), (2, 2)):
         prior = dataclasses.replace(LOW_CAR, past_ends_m=past_ends_m)
         around = reference.count_points_around(box, prior, obstacles_of(xyz, np.ones(5)), AROUND)
@@ -767,7 +786,7 @@ def test_the_ring_of_a_long_vehicle_reaches_farther_past_its_ends_but_not_its_si
 def test_what_overhangs_the_visible_end_of_a_long_vehicle_is_its_own():
     box = np.array([10.0, 2.0, 8.0, 2.0, 0.0])
     xyz = np.array([[10, 2, 0], [5.65, 2, 0], [5.31, 2.5, 0], [5.25, 2, 0], [5.65, 0.85, 0], [14.35, 1.1, 0]])
-    for past_ends_m, counts in ((0, (1, 3)), (0.3, (2, 4)), (2, (3, 3))):
+    for past_ends_m, counts in ((0, (1, 3)), (0.3, (3, 3)), (2, (4, 2))):
         prior = dataclasses.replace(LOW_CAR, past_ends_m=past_ends_m)
         around = reference.count_points_around(box, prior, obstacles_of(xyz, np.ones(6)), AROUND)
         assert (around.num_inside, around.num_ring) == counts, past_ends_m
@@ -777,6 +796,15 @@ def test_what_overhangs_the_visible_end_of_a_long_vehicle_is_its_own():
         np.array([0.0, 2.0, 8.0, 2.0, 0.0]), prior, obstacles_of(xyz - [10, 0, 0], np.ones(6)), AROUND
     )
     assert aside.num_inside == 1
+
+
+def test_what_overhangs_the_visible_side_of_a_van_is_its_own_and_the_ring_begins_there():
+    box = np.array([0.0, 10.0, 8.0, 2.0, 0.0])
+    xyz = np.array([[0, 8.65, 0], [0, 8.55, 0], [0, 8.25, 0], [0, 11.35, 0], [0, 11.55, 0.0]])
+    for past_ends_m, counts in ((0, (0, 3)), (0.2, (0, 3)), (0.3, (1, 3)), (2, (1, 3))):
+        prior = dataclasses.replace(LOW_CAR, past_ends_m=past_ends_m)
+        around = reference.count_points_around(box, prior, obstacles_of(xyz, np.ones(5)), AROUND)
+        assert (around.num_inside, around.num_ring) == counts, past_ends_m
 
 
 def test_what_is_behind_a_box_counts_the_less_the_surer_the_box_is():
@@ -829,7 +857,7 @@ def test_the_far_end_of_a_side_that_is_seen_is_at_its_last_point_and_a_hidden_on
 
     def length(box, **changes):
         seen = dataclasses.replace(around, **changes)
-        answered, sure = reference.end_where_seen(np.array(box), seen, 3.9, rule, 0.004)
+        answered, sure = reference.end_where_seen(np.array(box), seen, CAR, rule, 0.004)
         assert (sure > 0) == (answered[2] != box[2])
         nearest = [
             np.linalg.norm(turned(each[2:4] / 2 * CORNERS, each[4]) + each[:2], axis=1).min()

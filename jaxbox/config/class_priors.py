@@ -47,6 +47,9 @@ class ClassPrior:
     so."""
     max_height_m: Scalar
     """Higher tops are not such a vehicle."""
+    whole_from_m: Scalar
+    """From this measured length on it may be no longer than it is seen, where lengths differ as much as those
+    of trucks; the usual length asks for nothing."""
     max_length_m: Scalar
     """Longer measured extents are not such a vehicle."""
     max_width_m: Scalar
@@ -66,7 +69,8 @@ class ClassPrior:
     ``vehicles.tall_upright_score``; more than any height for classes that have no such vehicles."""
     past_ends_m: Scalar
     """Points so much farther past the ends of the box speak against it too, see ``vehicles.ring_m``: walls
-    and facades go on there. Those up to .6 m before the end that the sensor sees are its own."""
+    and facades go on there. Those up to .6 m before the end and .3 m before the side that the sensor sees are
+    its own."""
     open_below: Scalar
     """Share of the free space behind hits that is no evidence against such a vehicle: 1 or more where beams
     pass below the body, 0 where they do not. Where they do, returns from higher up are hits too, see
@@ -116,8 +120,8 @@ class Label(enum.IntEnum):
     cluster is tried as the first class, and only large clusters as the others too.
 
     Sizes are medians over the 7,481 KITTI object label files, but for the length of trucks, which is mostly
-    hidden (median 10.81 m): a truck of 4.3 to 17 m overlaps with one of 8.5 m by half. Gates and widths were
-    chosen on KITTI.
+    hidden (median 10.81 m): a truck of 4.3 to 17 m overlaps with one of 8.5 m by half, and from half of that
+    on it may be as long as it is seen. Gates and widths were chosen on KITTI.
 
     >>> Label.VAN, Label.VAN.word, Label.VAN.prior.length_m
     (<Label.VAN: 1>, 'van', 4.98)
@@ -178,6 +182,7 @@ class Label(enum.IntEnum):
         min_cut_height_m=0.4,
         min_bumper_m=0.4,
         max_height_m=2.3,
+        whole_from_m=3.9,
         max_length_m=6.5,
         max_width_m=2.4,
         min_box_height_m=1.48,
@@ -203,16 +208,17 @@ class Label(enum.IntEnum):
         min_cut_height_m=2.2,
         min_bumper_m=10.0,
         max_height_m=2.7,
+        whole_from_m=4.98,
         max_length_m=7.5,
         max_width_m=2.6,
         min_box_height_m=1.8,
-        prior_weight=0.5,
+        prior_weight=0.6,
         count_max_height_m=2.7,
         recess_m=0.15,
         upright_from_m=10.0,
-        past_ends_m=0.0,
-        open_below=0.0,
-        own_share=0.4,
+        past_ends_m=2.0,
+        open_below=1.0,
+        own_share=0.8,
         min_open=0.0,
     )
     TRUCK = ClassPrior(
@@ -228,6 +234,7 @@ class Label(enum.IntEnum):
         min_cut_height_m=1.8,
         min_bumper_m=10.0,
         max_height_m=4.2,
+        whole_from_m=4.25,
         max_length_m=18.0,
         max_width_m=3.2,
         min_box_height_m=2.6,

@@ -291,6 +291,11 @@ def share_seen(measured_m: float, usual_m: Scalar, seen: Scalar) -> float:
     return float(np.clip((measured_m / usual_m - seen) / SEEN_RAMP, 0, 1))
 
 
+def seen_from(share: Scalar, prior: ClassPrior) -> float:
+    """From which share of a class's length on a length may be seen whole: less where lengths differ."""
+    return min(float(share), float(prior.whole_from_m / prior.length_m))
+
+
 def likely_sizes(sides: Assignment, prior: ClassPrior, config: CompletionConfig) -> tuple[float, float]:
     """The class's size for sides that may be hidden in part; between it and the measured for the others.
 
@@ -312,7 +317,7 @@ def likely_sizes(sides: Assignment, prior: ClassPrior, config: CompletionConfig)
 
     length, width = sides.measured
     return (
-        likely(length, prior.length_m, config.seen_length, config.length_margin_m),
+        likely(length, prior.length_m, seen_from(config.seen_length, prior), config.length_margin_m),
         likely(width, prior.width_m, config.seen_width, config.width_margin_m),
     )
 
@@ -349,7 +354,7 @@ def place(sides: Assignment, sizes: tuple[float, float], placement: int, objecti
 
 
 def place_widths(sides: Assignment, prior: ClassPrior) -> np.ndarray:
-    """Completes boxes to the class's size, or the measured where that is larger.
+    """Completes boxes to the class's size, or the measured where that is larger, or may be the whole length.
 
     Args:
       sides: as measured.
@@ -358,7 +363,9 @@ def place_widths(sides: Assignment, prior: ClassPrior) -> np.ndarray:
     Returns:
       (3, 5) boxes, one a placement; the length is completed away from the sensor.
     """
-    sizes = float(prior.length_m), float(prior.width_m)
+    measured_m, usual_m = sides.measured[0], float(prior.length_m)
+    whole = share_seen(measured_m, usual_m, seen_from(1.0, prior))
+    sizes = max(usual_m + whole * (measured_m - usual_m), measured_m), float(prior.width_m)
     return np.array([place(sides, sizes, placement, CERTAIN).box for placement in (AWAY, TOWARDS, BOTH)])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import expit
 
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, Scalar, VehicleConfig
-from jaxbox.reference.completion import share_seen
+from jaxbox.reference.completion import seen_from, share_seen
 from jaxbox.reference.evidence import GroundElevation, closed_free_length
 from jaxbox.reference.rows import find_lines, hit_share
 from jaxbox.reference.state import (
@@ -72,7 +72,7 @@ def score_boxes(
         threes = bool(in_threes[row])
         around = _look_around(box.box, prior, cluster, score, threes, obstacles, config.vehicles)
         if config.vehicles.neighbourhood and config.completion.mode != "none":
-            ended, seen = _end_where_seen(box, around, float(prior.length_m), config)
+            ended, seen = _end_where_seen(box, around, prior, config)
             box = box if box.in_row else dataclasses.replace(box, box=ended)
             score *= seen + float(config.vehicles.hidden_length_score) * (1 - seen)
         rho = float(np.hypot(box.box[0], box.box[1]))
@@ -156,12 +156,13 @@ def _look_around(
 
 
 def _end_where_seen(
-    box: CompletedBox, around: NeighbourhoodCounts, usual_m: float, config: DetectorConfig
+    box: CompletedBox, around: NeighbourhoodCounts, prior: ClassPrior, config: DetectorConfig
 ) -> tuple[np.ndarray, float]:
     """The box (5,) with its end where it is seen, and how sure its length is."""
     beam_angle = 2 * np.pi / config.evidence.num_azimuths
-    ended, seen = end_where_seen(box.box, around, usual_m, config.completion, beam_angle)
-    return ended, max(seen, share_seen(box.measured_length_m, usual_m, config.completion.seen_length))
+    ended, seen = end_where_seen(box.box, around, prior, config.completion, beam_angle)
+    whole_from = seen_from(config.completion.seen_length, prior)
+    return ended, max(seen, share_seen(box.measured_length_m, prior.length_m, whole_from))
 
 
 def own_score(around: NeighbourhoodCounts, num_points: int, prior: ClassPrior) -> float:
@@ -199,7 +200,7 @@ def keep_best(candidates: Sequence[Candidate], config: VehicleConfig) -> Kept:
 def end_where_seen(
     box: np.ndarray,
     around: NeighbourhoodCounts,
-    usual_m: float,
+    prior: ClassPrior,
     config: CompletionConfig,
     beam_angle: float,
 ) -> tuple[np.ndarray, float]:
@@ -208,7 +209,7 @@ def end_where_seen(
     Args:
       box: (5,): x, y, length, width in m and yaw in rad.
       around: all points inside; the farthest tells where the end is.
-      usual_m: length of the class.
+      prior: of the class.
       config: `end_length` of the class's length is the least that shows an end; from `end_slope` on beams
         show it for sure, and `end_points` points half so.
       beam_angle: rad, between neighbouring beams: an azimuth cell of the evidence.
@@ -219,7 +220,7 @@ def end_where_seen(
     along, across = sensor_outside(box)
     view = np.arctan2(across, along)
     weight = min(np.tan(min(view, 1.5)) / float(config.end_slope), 1.0)
-    weight *= share_seen(around.deepest, usual_m, config.end_length)
+    weight *= share_seen(around.deepest, prior.length_m, seen_from(config.end_length, prior))
     weight *= around.num_inside / (around.num_inside + float(config.end_points))
     # Beams that meet the side at that angle, so far away, are so far apart on it.
     spacing_m = beam_angle * np.hypot(along, across) / np.sin(view) if view > 0 else np.inf

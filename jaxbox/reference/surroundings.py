@@ -9,9 +9,9 @@ NUM_LEVELS = 20
 """Levels of height by which the top is found."""
 SIDE_DEPTHS_M = -0.15, 0.35
 """Points at these depths behind the long side that the sensor sees lie along it."""
-OVERHANG_M = 0.6
-"""Points so far before the end that the sensor sees are of the vehicle, where those beyond speak against
-it."""
+OVERHANGS_M = 0.6, 0.3
+"""Points so far before the end and the side that the sensor sees are of the vehicle, where those past its
+ends speak against it."""
 LOWEST_LEVEL = 0.4
 """Where the levels begin, as a share of the highest that points of the vehicle may have."""
 
@@ -57,7 +57,10 @@ def count_points_around(
     held = xy[(distance_outside(xy, box) < config.margin_m) & (height < prior.count_max_height_m)]
     counted = ~is_behind(xy, box, config.ring_m - (config.ring_m + config.margin_m) * sure)
     xy, height = xy[counted], height[counted]
-    within = (distance_outside(xy, box) < config.margin_m) | _overhangs(xy, box, prior, config)
+    along, across = _outside_body(xy, box, prior).T
+    within = np.maximum(along, across) < config.margin_m
+    past_ends = np.abs(in_box_frame(xy, box)[:, 0]) - longer[2] / 2
+    ring = ~within & (np.maximum(past_ends, across) < config.ring_m)
     counted = height < prior.count_max_height_m
     upper = within & counted & (height > config.upper_height_m)
     top = top_of(height[within & counted], float(prior.count_max_height_m), float(config.top_quantile))
@@ -65,22 +68,19 @@ def count_points_around(
         num_inside=int((within & counted).sum()),
         top=top,
         num_above=int((within & ~counted).sum()),
-        num_ring=int((~within & (distance_outside(xy, longer) < config.ring_m) & counted).sum()),
+        num_ring=int((ring & counted).sum()),
         num_upper=int(upper.sum()),
         num_recessed=int((upper & (depth_behind_faces(xy, box) > prior.recess_m)).sum()),
         deepest=float(np.max(depth_behind_end(held, box), initial=0.0)),
     )
 
 
-def _overhangs(xy: np.ndarray, box: np.ndarray, prior: ClassPrior, config: VehicleConfig) -> np.ndarray:
-    """(n,) bool: points a little before the end that a sensor at the origin sees, of long vehicles."""
-    sensor, half_length = in_box_frame(np.zeros(2), box), box[2] / 2
-    if abs(sensor[0]) <= half_length:
-        return np.zeros(len(xy), bool)
-    local = in_box_frame(xy, box)
-    ahead = np.sign(sensor[0]) * local[:, 0]
-    reach_m = half_length + min(prior.past_ends_m, OVERHANG_M) + config.margin_m
-    return (ahead > 0) & (ahead < reach_m) & (np.abs(local[:, 1]) < box[3] / 2 + config.margin_m)
+def _outside_body(xy: np.ndarray, box: np.ndarray, prior: ClassPrior) -> np.ndarray:
+    """(n, 2) m: how far points lie outside, along and across, of a box that overhangs towards the sensor."""
+    local, sensor = in_box_frame(xy, box), in_box_frame(np.zeros(2), box)
+    seen = (np.abs(sensor) > box[2:4] / 2) & (local * np.sign(sensor) > 0)
+    overhangs = seen * np.minimum(float(prior.past_ends_m), OVERHANGS_M)
+    return np.abs(local) - (box[2:4] / 2 + overhangs)
 
 
 def cluster_alone(num_points: int, top: float) -> NeighbourhoodCounts:

@@ -95,6 +95,19 @@ def share_seen(measured: jax.Array, usual: jax.Array | float, seen: jax.Array | 
     return jnp.clip((measured / usual - seen) / SEEN_RAMP, 0, 1)
 
 
+def seen_from(share: jax.Array | float, prior: ClassPrior) -> jax.Array:
+    """From which fraction of a class's length on a length may be seen whole.
+
+    Args:
+      share: of classes with one usual length.
+      prior: fields of (...) float32.
+
+    Returns:
+      (...) float32: less of classes whose lengths differ.
+    """
+    return jnp.minimum(share, prior.whole_from_m / prior.length_m)
+
+
 def likely_sizes(
     sides: Assignments, prior: ClassPrior, config: CompletionConfig
 ) -> tuple[jax.Array, jax.Array]:
@@ -123,7 +136,7 @@ def likely_sizes(
 
     length, width = sides.measured
     return (
-        likely(length, prior.length_m, config.seen_length, config.length_margin_m),
+        likely(length, prior.length_m, seen_from(config.seen_length, prior), config.length_margin_m),
         likely(width, prior.width_m, config.seen_width, config.width_margin_m),
     )
 

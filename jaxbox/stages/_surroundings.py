@@ -19,7 +19,7 @@ NEARBY_CELL_M = 1.0
 """Points are looked up by cells of this size."""
 
 
-MAX_CELL_ROWS = 24
+MAX_CELL_ROWS = 25
 """Rows of cells round a box: a vehicle of 18 m, the longest that passes the gates, with its ring."""
 
 
@@ -40,9 +40,10 @@ SIDE_DEPTH_M, SIDE_HALF_M = 0.1, 0.25
 the second, go on along that side: they are of what the box holds a part of."""
 
 
-OVERHANG_M = 0.6
+END_OVERHANG_M, SIDE_OVERHANG_M = 0.6, 0.3
 """Where points past the ends speak against a vehicle (`ClassPrior.past_ends_m`), those up to here before the
-end that the sensor sees are its own: cargo bodies reach beyond the bumpers that a box is fitted to."""
+end and the side that the sensor sees are its own: bodies reach beyond the bumpers and sills that a box is
+fitted to."""
 
 
 def count_points_around(
@@ -91,8 +92,10 @@ def count_points_around(
     def prepare(rows: tuple[jax.Array, ...]) -> tuple[jax.Array, list[jax.Array], list[jax.Array]]:
         boxes, *others = rows
         frames = _frames(boxes, *others)
-        reach = jnp.abs(frames[:, 2:4]) * (frames[:, 6:7] + ring_m)
-        reach = reach + jnp.abs(frames[:, 3:1:-1]) * (frames[:, 5:6] + ring_m)
+        half_l, half_w, ring_half_l = (frames[:, k, None] for k in (4, 5, 6))
+        ring_half_w = half_w + jnp.minimum(ring_half_l - half_l, SIDE_OVERHANG_M)
+        reach = jnp.abs(frames[:, 2:4]) * (ring_half_l + ring_m)
+        reach = reach + jnp.abs(frames[:, 3:1:-1]) * (ring_half_w + ring_m)
         low = [cell(boxes[:, axis] - reach[:, axis], axis) for axis in (0, 1)]
         return frames, low, [cell(boxes[:, axis] + reach[:, axis], axis) for axis in (0, 1)]
 
@@ -204,13 +207,16 @@ def _judge(
     toward_u, toward_v = facing_u * u, facing_v * v
     is_along = jnp.abs(toward_v - side_v) < SIDE_HALF_M
     is_behind = (toward_v < far_v) | (toward_u < far_u) & ~is_along
-    out_u, out_v = jnp.abs(u), jnp.where(valid & ~is_behind, jnp.abs(v) - half_w, jnp.inf)
     # The depth behind a face is finite where the sensor sees the face.
-    overhang = jnp.where(
-        (toward_u > 0) & (near_u < jnp.inf), jnp.minimum(ring_half_l - half_l, OVERHANG_M), 0
+    end, side = (
+        jnp.where((toward > 0) & (near < jnp.inf), jnp.minimum(ring_half_l - half_l, overhang_m), 0)
+        for toward, near, overhang_m in (
+            (toward_u, near_u, END_OVERHANG_M),
+            (toward_v, near_v, SIDE_OVERHANG_M),
+        )
     )
-    body_half_l = half_l + overhang
-    inside, low = jnp.maximum(out_u - body_half_l, out_v) < config.margin_m, height < max_height
+    out_u, out_v = jnp.abs(u), jnp.where(valid & ~is_behind, jnp.abs(v) - (half_w + side), jnp.inf)
+    inside, low = jnp.maximum(out_u - (half_l + end), out_v) < config.margin_m, height < max_height
     upper = inside & low & (height > config.upper_height_m)
     recessed = upper & (toward_u < near_u) & (toward_v < near_v)
     ring = ~inside & low & (jnp.maximum(out_u - ring_half_l, out_v) < config.ring_m)

@@ -23,6 +23,8 @@ from jaxbox.stages._assignments import (
     likely_sizes,
     longer_side,
     place,
+    seen_from,
+    share_seen,
 )
 from jaxbox.stages._priors import closed_free_length, is_raised, prior_of
 from jaxbox.stages._rows import find_rows, hit_share, visible_ends
@@ -315,7 +317,7 @@ class Placements:
 
 
 def place_widths(sides: Assignments, prior: ClassPrior) -> Placements:
-    """Completes boxes to the class's size, or the measured where that is larger.
+    """Completes boxes to the class's size, or the measured where that is larger, or may be the whole length.
 
     Args:
       sides: C of them.
@@ -326,9 +328,11 @@ def place_widths(sides: Assignments, prior: ClassPrior) -> Placements:
 
     Reference: oracle `jaxbox.reference.place_widths`.
     """
-    length, width = (
-        jnp.maximum(a, b) for a, b in zip((prior.length_m, prior.width_m), sides.measured, strict=True)
-    )
+    measured_length, measured_width = sides.measured
+    usual = jnp.asarray(prior.length_m)
+    whole = share_seen(measured_length, usual, seen_from(1.0, prior))
+    length = jnp.maximum(usual + whole * (measured_length - usual), measured_length)
+    width = jnp.maximum(prior.width_m, measured_width)
     return Placements(
         yaw=sides.yaw,
         u=extend(sides.along, length)[0],

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, VehicleConfig
 from jaxbox.geometry.planar import wrap_yaw
-from jaxbox.stages._assignments import share_seen
+from jaxbox.stages._assignments import seen_from, share_seen
 from jaxbox.stages._priors import asymmetric_gaussian, closed_free_length, prior_of, size_score
 from jaxbox.stages._rows import find_lines, hit_share
 from jaxbox.stages._suppression import non_max_suppression
@@ -202,10 +202,11 @@ def _end_where_seen(
     config: DetectorConfig,
 ) -> tuple[jax.Array, jax.Array]:
     """The rectangles (P, 5) with their ends where they are seen, and how sure their length is (P,)."""
-    usual_m = prior_of(config.vehicles.classes, label).length_m
+    prior = prior_of(config.vehicles.classes, label)
     beam_angle = 2 * math.pi / config.evidence.num_azimuths
-    ended, seen = end_where_seen(rectangles, around, usual_m, config.completion, beam_angle)
-    return ended, jnp.maximum(seen, share_seen(measured_m, usual_m, config.completion.seen_length))
+    ended, seen = end_where_seen(rectangles, around, prior, config.completion, beam_angle)
+    whole_from = seen_from(config.completion.seen_length, prior)
+    return ended, jnp.maximum(seen, share_seen(measured_m, prior.length_m, whole_from))
 
 
 def _finish(rows: tuple[Any, ...], reach: jax.Array, clusters: Clusters, config: VehicleConfig) -> Candidates:
@@ -293,7 +294,7 @@ def evidence_score(
 def end_where_seen(
     rectangles: jax.Array,
     around: NeighbourhoodCounts,
-    usual_m: jax.Array | float,
+    prior: ClassPrior,
     config: CompletionConfig,
     beam_angle: float,
 ) -> tuple[jax.Array, jax.Array]:
@@ -306,7 +307,7 @@ def end_where_seen(
     Args:
       rectangles: (P, 5) float32: x, y, length, width (m), yaw (rad).
       around: all points inside; those as far apart as the class is long, and more, show the end.
-      usual_m: (P,) float32, of the class.
+      prior: fields of (P,) float32.
       config: from which fraction of the class's length on the points may show the end, at which slope of
         the beams against the side it is sure, and how many points make it half so.
       beam_angle: rad, between neighbouring beams: an azimuth cell of the evidence.
@@ -320,7 +321,7 @@ def end_where_seen(
     x, y, length, width, yaw = rectangles.T
     along, across = _distances_outside(rectangles)
     steep = jnp.minimum(across / jnp.maximum(along, 1e-3) / config.end_slope, 1)
-    whole = share_seen(around.deepest, usual_m, config.end_length)
+    whole = share_seen(around.deepest, prior.length_m, seen_from(config.end_length, prior))
     dense = around.num_inside / (around.num_inside + config.end_points)
     spacing_m = beam_angle * (along**2 + across**2) / jnp.maximum(across, 1e-3)
     seen_m = around.deepest + jnp.minimum(spacing_m / 2, MAX_END_MARGIN_M)
