@@ -99,6 +99,37 @@ def _preset_figures(accuracy_of_20: str, ending: str) -> dict[str, float]:
     }
 
 
+def classes() -> str:
+    """What is found of each class, and how many boxes of it are right."""
+    report = load("classes")
+
+    def share(part: int, whole: int) -> str:
+        return f"{part} of {whole}"
+
+    rows = [
+        (
+            kind,
+            share(row["found 30"], row["labels 30"]),
+            share(row["found 100"], row["labels 100"]),
+            share(row["right"], row["boxes"]),
+            row["false"],
+            "none" if row["cut"] is None else row["cut"],
+            share(row["found 100 from the cut"], row["labels 100"]),
+        )
+        for kind, row in report["classes"].items()
+    ]
+    header = [
+        "",
+        "found, 30 points",
+        "found, 100 points",
+        "right",
+        "false",
+        "9 of 10 right from",
+        "found then",
+    ]
+    return table(header, rows) + made_with(report)
+
+
 def ablation() -> str:
     """What is gained or lost without each part, in the mean of copies."""
     report = load("ablation")
@@ -730,6 +761,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "accuracy": accuracy,
     "ablation": ablation,
     "readings": readings,
+    "classes": classes,
     "sizes": sizes,
     "paper": paper_table,
     "sensors": sensors,

@@ -1,0 +1,61 @@
+"""The benchmark of classes: which labels are found, and from which cut on nine of ten boxes are right."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+from benchmarks import bench_classes as bench
+
+RESULTS = pathlib.Path(__file__).parents[1] / "benchmarks" / "results"
+
+
+def box(x, length=4.0):
+    return [x, 0.0, 0.0, length, 2.0, 1.5, 0.0]
+
+
+def test_a_label_has_the_score_of_the_best_box_that_covers_half_of_it():
+    labels = np.array([box(0), box(20), box(40)])
+    boxes = np.array([box(0), box(0.2), box(22), box(40, length=7.9), box(40, length=8.1)])
+    best = bench.best_scores(labels, boxes, np.array([0.3, 0.6, 0.9, 0.2, 0.8]))
+    np.testing.assert_allclose(best, [0.6, 0, 0.2])
+    assert bench.best_scores(labels, boxes[:0], np.zeros(0)).tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("right", "cut"),
+    [
+        ([1] * 10, 0.0),
+        ([1] * 9 + [0], 0.0),
+        ([1] * 8 + [0, 0], 0.2),
+        # Later right ones make up for an early false one.
+        ([0] + [1] * 9, 0.0),
+        ([0] * 10, None),
+        ([], None),
+    ],
+)
+def test_the_cut_is_the_least_score_from_which_nine_of_ten_are_right(right, cut):
+    scores = np.linspace(0.9, 0, 10)[: len(right)]
+    assert bench.cut_of(scores, np.array(right, bool)) == (None if cut is None else pytest.approx(cut))
+
+
+def test_counts_are_by_class_and_points():
+    frame = {
+        "labels": [("Truck", 120, 0.3), ("Truck", 40, 0.1), ("Van", 99, 0.15), ("Pedestrian", 200, 0.9)],
+        "boxes": [("Truck", 0.4, 0.6), ("Truck", 0.2, 0.2), ("Truck", 0.16, 0.0), ("Car", 0.9, 0.9)],
+    }
+    table = bench.summarise([frame, frame])
+    truck, van = table["Truck"], table["Van"]
+    assert (truck["labels 30"], truck["found 30"], truck["labels 100"], truck["found 100"]) == (4, 2, 2, 2)
+    assert (truck["boxes"], truck["right"], truck["false"], truck["cut"]) == (6, 2, 2, 0.4)
+    assert truck["found 100 from the cut"] == 0
+    assert (van["labels 30"], van["found 30"], van["labels 100"], van["cut"]) == (2, 2, 0, None)
+
+
+def test_the_record_is_of_all_frames_and_copies():
+    report = json.loads((RESULTS / "classes.json").read_text())
+    assert (report["num_frames"], report["num_copies"]) == (78, 6)
+    for row in report["classes"].values():
+        assert row["false"] <= row["boxes"] - row["right"]
+        assert row["found 100 from the cut"] <= row["found 100"] <= row["labels 100"]
