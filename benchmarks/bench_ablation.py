@@ -114,7 +114,14 @@ ABLATIONS = (
     Ablation("hidden lengths count as seen ones", {"vehicles.hidden_length_score": 1.0}),
     Ablation("no bumpers alone", {"vehicles.bumper_from_m": NO_LIMIT}),
     Ablation("tops are as high as seen, cut off, bumpers or not", {"vehicles.unseen_top_score": 0.0}),
-    Ablation("trucks: nothing past the ends counts", {"vehicles.classes.2.past_ends_m": 0.0}),
+    Ablation("trucks: nothing past the ends counts, nothing overhangs", {
+        "vehicles.classes.2.past_ends_m": 0.0,
+    }),
+    Ablation("trucks: judged no shorter than usual", {"vehicles.classes.2.whole_from_m": 8.5}),
+    Ablation("vans: nothing past the ends counts, nothing overhangs", {
+        "vehicles.classes.1.past_ends_m": 0.0,
+    }),
+    Ablation("vans: free space below the body counts", {"vehicles.classes.1.open_below": 0.0}),
     Ablation("trucks: free space below the body counts", {"vehicles.classes.2.open_below": 0.0}),
     Ablation("trucks: hits no higher than those of cars", {"evidence.raised_hit_max_height_m": 1.2}),
     Ablation("vans, trucks: boxes that other points fill count in full", {
