@@ -16,9 +16,8 @@ from typing import Any
 
 import numpy as np
 
-import jaxbox
 from benchmarks import common
-from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig, Label, PointCloud
+from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig, Label
 from jaxbox.evaluation import pairwise_overlaps
 from jaxbox.evaluation.copies import (
     COPIES,
@@ -56,8 +55,7 @@ def best_scores(labels: np.ndarray, boxes: np.ndarray, scores: np.ndarray) -> np
 
 def measure(frame: Frame, copy: Copy, num_points: np.ndarray, config: DetectorConfig) -> dict[str, Any]:
     """Of one frame: labels as (type, points, best score), and shown boxes as (type, score, overlap)."""
-    cloud = PointCloud.from_numpy(turn_points(frame.xyz, copy), frame.intensity)
-    found = turn_back(jaxbox.detect(cloud, config).on_host(), copy)
+    found = turn_back(common.detect(turn_points(frame.xyz, copy), frame.intensity, config), copy)
     valid = np.asarray(found.valid)
     boxes, scores = common.box_rows(found)[valid], np.asarray(found.score)[valid]
     # Regions without a box have no number of points.

@@ -291,9 +291,28 @@ def share_seen(measured_m: float, usual_m: Scalar, seen: Scalar) -> float:
     return float(np.clip((measured_m / usual_m - seen) / SEEN_RAMP, 0, 1))
 
 
-def seen_from(share: Scalar, prior: ClassPrior) -> float:
-    """From which share of a class's length on a length may be seen whole: less where lengths differ."""
-    return min(float(share), float(prior.whole_from_m / prior.length_m))
+def share_of_length_seen(measured_m: float, prior: ClassPrior, seen: Scalar) -> float:
+    """How sure it is that a length is seen whole: from less than `seen` on where a class's lengths differ."""
+    least = min(float(seen), float(prior.whole_from_m / prior.length_m))
+    return share_seen(measured_m, prior.length_m, least)
+
+
+def likely_size(
+    measured_m: float, usual_m: Scalar, whole: float, *, weight: Scalar = 1.0, margin_m: Scalar = 0.0
+) -> float:
+    """The usual size of a side that may be hidden in part, the measured one of a side that is seen whole.
+
+    Args:
+      measured_m: m, how much of it shows.
+      usual_m: m, of the class.
+      whole: how sure it is that it is seen whole.
+      weight: of the measured size then.
+      margin_m: by how much measured sides read short.
+
+    Returns:
+      m, at least as measured.
+    """
+    return float(max(usual_m + weight * whole * (measured_m + margin_m - usual_m), measured_m))
 
 
 def likely_sizes(sides: Assignment, prior: ClassPrior, config: CompletionConfig) -> tuple[float, float]:
@@ -308,17 +327,15 @@ def likely_sizes(sides: Assignment, prior: ClassPrior, config: CompletionConfig)
     Returns:
       Length and width, m, at least as measured.
     """
-
-    def likely(measured_m: float, usual_m: Scalar, seen: Scalar, margin_m: Scalar) -> float:
-        whole = share_seen(measured_m, usual_m, seen)
-        return float(
-            max(usual_m + config.seen_weight * whole * (measured_m + margin_m - usual_m), measured_m)
-        )
-
     length, width = sides.measured
+    whole = (
+        share_of_length_seen(length, prior, config.seen_length),
+        share_seen(width, prior.width_m, config.seen_width),
+    )
+    weight, margins_m = config.seen_weight, (config.length_margin_m, config.width_margin_m)
     return (
-        likely(length, prior.length_m, seen_from(config.seen_length, prior), config.length_margin_m),
-        likely(width, prior.width_m, config.seen_width, config.width_margin_m),
+        likely_size(length, prior.length_m, whole[0], weight=weight, margin_m=margins_m[0]),
+        likely_size(width, prior.width_m, whole[1], weight=weight, margin_m=margins_m[1]),
     )
 
 
@@ -363,9 +380,8 @@ def place_widths(sides: Assignment, prior: ClassPrior) -> np.ndarray:
     Returns:
       (3, 5) boxes, one a placement; the length is completed away from the sensor.
     """
-    measured_m, usual_m = sides.measured[0], float(prior.length_m)
-    whole = share_seen(measured_m, usual_m, seen_from(1.0, prior))
-    sizes = max(usual_m + whole * (measured_m - usual_m), measured_m), float(prior.width_m)
+    whole = share_of_length_seen(sides.measured[0], prior, 1.0)
+    sizes = likely_size(sides.measured[0], prior.length_m, whole), float(prior.width_m)
     return np.array([place(sides, sizes, placement, CERTAIN).box for placement in (AWAY, TOWARDS, BOTH)])
 
 

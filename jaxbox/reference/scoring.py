@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import expit
 
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, Scalar, VehicleConfig
-from jaxbox.reference.completion import seen_from, share_seen
+from jaxbox.reference.completion import share_of_length_seen
 from jaxbox.reference.evidence import GroundElevation, closed_free_length
 from jaxbox.reference.rows import find_lines, hit_share
 from jaxbox.reference.state import (
@@ -161,8 +161,8 @@ def _end_where_seen(
     """The box (5,) with its end where it is seen, and how sure its length is."""
     beam_angle = 2 * np.pi / config.evidence.num_azimuths
     ended, seen = end_where_seen(box.box, around, prior, config.completion, beam_angle)
-    whole_from = seen_from(config.completion.seen_length, prior)
-    return ended, max(seen, share_seen(box.measured_length_m, prior.length_m, whole_from))
+    whole = share_of_length_seen(box.measured_length_m, prior, config.completion.seen_length)
+    return ended, max(seen, whole)
 
 
 def own_score(around: NeighbourhoodCounts, num_points: int, prior: ClassPrior) -> float:
@@ -220,7 +220,7 @@ def end_where_seen(
     along, across = sensor_outside(box)
     view = np.arctan2(across, along)
     weight = min(np.tan(min(view, 1.5)) / float(config.end_slope), 1.0)
-    weight *= share_seen(around.deepest, prior.length_m, seen_from(config.end_length, prior))
+    weight *= share_of_length_seen(around.deepest, prior, config.end_length)
     weight *= around.num_inside / (around.num_inside + float(config.end_points))
     # Beams that meet the side at that angle, so far away, are so far apart on it.
     spacing_m = beam_angle * np.hypot(along, across) / np.sin(view) if view > 0 else np.inf

@@ -95,17 +95,41 @@ def share_seen(measured: jax.Array, usual: jax.Array | float, seen: jax.Array | 
     return jnp.clip((measured / usual - seen) / SEEN_RAMP, 0, 1)
 
 
-def seen_from(share: jax.Array | float, prior: ClassPrior) -> jax.Array:
-    """From which fraction of a class's length on a length may be seen whole.
+def share_of_length_seen(measured: jax.Array, prior: ClassPrior, seen: jax.Array | float) -> jax.Array:
+    """How sure it is that a length is seen whole: from less on in classes whose lengths differ.
 
     Args:
-      share: of classes with one usual length.
+      measured: (...) float32, m, how much of it shows.
       prior: fields of (...) float32.
+      seen: fraction of the usual length from which on it may be seen whole in classes of one length.
 
     Returns:
-      (...) float32: less of classes whose lengths differ.
+      (...) float32, in [0, 1], see `share_seen`.
     """
-    return jnp.minimum(share, prior.whole_from_m / prior.length_m)
+    return share_seen(measured, prior.length_m, jnp.minimum(seen, prior.whole_from_m / prior.length_m))
+
+
+def likely_size(
+    measured: jax.Array,
+    usual: jax.Array | float,
+    whole: jax.Array,
+    *,
+    weight: jax.Array | float = 1.0,
+    margin_m: jax.Array | float = 0.0,
+) -> jax.Array:
+    """The usual size of a side that may be hidden in part, the measured one of a side that is seen whole.
+
+    Args:
+      measured: (...) float32, m.
+      usual: m, size of the class.
+      whole: (...) float32, how sure it is that it is seen whole.
+      weight: of the measured size then.
+      margin_m: by how much measured sides read short.
+
+    Returns:
+      (...) float32, m, between them, and at least as measured.
+    """
+    return jnp.maximum(usual + weight * whole * (measured + margin_m - usual), measured)
 
 
 def likely_sizes(
@@ -124,20 +148,15 @@ def likely_sizes(
 
     Reference: oracle `jaxbox.reference.likely_sizes`.
     """
-
-    def likely(
-        measured: jax.Array,
-        usual: jax.Array | float,
-        seen: jax.Array | float,
-        margin_m: jax.Array | float,
-    ) -> jax.Array:
-        whole = share_seen(measured, usual, seen)
-        return jnp.maximum(usual + config.seen_weight * whole * (measured + margin_m - usual), measured)
-
     length, width = sides.measured
+    whole = (
+        share_of_length_seen(length, prior, config.seen_length),
+        share_seen(width, prior.width_m, config.seen_width),
+    )
+    weight, margins_m = config.seen_weight, (config.length_margin_m, config.width_margin_m)
     return (
-        likely(length, prior.length_m, seen_from(config.seen_length, prior), config.length_margin_m),
-        likely(width, prior.width_m, config.seen_width, config.width_margin_m),
+        likely_size(length, prior.length_m, whole[0], weight=weight, margin_m=margins_m[0]),
+        likely_size(width, prior.width_m, whole[1], weight=weight, margin_m=margins_m[1]),
     )
 
 

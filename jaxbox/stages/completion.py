@@ -20,11 +20,11 @@ from jaxbox.stages._assignments import (
     extend_away,
     fits,
     keep_measured,
+    likely_size,
     likely_sizes,
     longer_side,
     place,
-    seen_from,
-    share_seen,
+    share_of_length_seen,
 )
 from jaxbox.stages._priors import closed_free_length, is_raised, prior_of
 from jaxbox.stages._rows import find_rows, hit_share, visible_ends
@@ -329,9 +329,8 @@ def place_widths(sides: Assignments, prior: ClassPrior) -> Placements:
     Reference: oracle `jaxbox.reference.place_widths`.
     """
     measured_length, measured_width = sides.measured
-    usual = jnp.asarray(prior.length_m)
-    whole = share_seen(measured_length, usual, seen_from(1.0, prior))
-    length = jnp.maximum(usual + whole * (measured_length - usual), measured_length)
+    whole = share_of_length_seen(measured_length, prior, 1.0)
+    length = likely_size(measured_length, prior.length_m, whole)
     width = jnp.maximum(prior.width_m, measured_width)
     return Placements(
         yaw=sides.yaw,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from jaxbox.config import ClassPrior, CompletionConfig, DetectorConfig, VehicleConfig
 from jaxbox.geometry.planar import wrap_yaw
-from jaxbox.stages._assignments import seen_from, share_seen
+from jaxbox.stages._assignments import share_of_length_seen
 from jaxbox.stages._priors import asymmetric_gaussian, closed_free_length, prior_of, size_score
 from jaxbox.stages._rows import find_lines, hit_share
 from jaxbox.stages._suppression import non_max_suppression
@@ -205,8 +205,7 @@ def _end_where_seen(
     prior = prior_of(config.vehicles.classes, label)
     beam_angle = 2 * math.pi / config.evidence.num_azimuths
     ended, seen = end_where_seen(rectangles, around, prior, config.completion, beam_angle)
-    whole_from = seen_from(config.completion.seen_length, prior)
-    return ended, jnp.maximum(seen, share_seen(measured_m, prior.length_m, whole_from))
+    return ended, jnp.maximum(seen, share_of_length_seen(measured_m, prior, config.completion.seen_length))
 
 
 def _finish(rows: tuple[Any, ...], reach: jax.Array, clusters: Clusters, config: VehicleConfig) -> Candidates:
@@ -321,7 +320,7 @@ def end_where_seen(
     x, y, length, width, yaw = rectangles.T
     along, across = _distances_outside(rectangles)
     steep = jnp.minimum(across / jnp.maximum(along, 1e-3) / config.end_slope, 1)
-    whole = share_seen(around.deepest, prior.length_m, seen_from(config.end_length, prior))
+    whole = share_of_length_seen(around.deepest, prior, config.end_length)
     dense = around.num_inside / (around.num_inside + config.end_points)
     spacing_m = beam_angle * (along**2 + across**2) / jnp.maximum(across, 1e-3)
     seen_m = around.deepest + jnp.minimum(spacing_m / 2, MAX_END_MARGIN_M)
