@@ -148,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = common.parser(__doc__ or "", quick="four sweeps and one draw, eight sweeps a sequence")
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS))
     parser.add_argument(
-        "--draws", type=common.at_least(1), default=10, help="changed copies of a sweep and a change"
+        "--draws", type=common.at_least(1), default=20, help="changed copies of a sweep and a change"
     )
     parser.add_argument("--lost", action="store_true", help="print boxes from score .3 on that do not stay")
     options = parser.parse_args(arguments)

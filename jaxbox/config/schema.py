@@ -309,7 +309,7 @@ class CompletionConfig:
     """Weight of the rectangle criterion."""
     not_away_cost: Scalar = 0.02
     """Cost of a width that does not extend away from the sensor."""
-    blend_objective: Scalar = 0.2
+    blend_objective: Scalar = 0.3
     """Boxes of a cluster with an objective less by up to this are blended into the best, where turned against
     it by 8 to 30 degrees: a little noise would decide between them. 0 blends none."""
     row_distance_m: Scalar = 3.0
@@ -400,7 +400,7 @@ class VehicleConfig:
     """Beyond this range fewer are asked for, by its cube: the road returns fewer, in rings far apart."""
     objective_gate: Scalar = 2.4
     """score / (1 + exp(-(J - gate) / softness)), J the objective of the completion."""
-    objective_softness: Scalar = 0.1
+    objective_softness: Scalar = 0.13
     """See ``objective_gate``."""
     min_score: Scalar = 1e-4
     """Boxes with lower scores are dropped from a reading. Where you act, cut at `DEFAULT_SCORE_THRESHOLD`."""

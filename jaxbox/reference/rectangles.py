@@ -82,7 +82,7 @@ def rectangle_candidates(
 
 
 def second_peak(curve: np.ndarray, num_points: int, *, max_loss: float) -> np.ndarray:
-    """The peaks of a curve that are 10 degrees or more from its best rotation.
+    """The peaks of a curve that are 6 degrees or more from its best rotation.
 
     Args:
       curve: (A,) larger is better.
@@ -94,7 +94,7 @@ def second_peak(curve: np.ndarray, num_points: int, *, max_loss: float) -> np.nd
     """
     turn = np.abs(np.arange(len(curve)) - np.argmax(curve)) * 90 / len(curve)
     is_peak = curve >= np.maximum(np.roll(curve, 1), np.roll(curve, -1))
-    others = np.where(is_peak & (np.minimum(turn, 90 - turn) >= 10), curve, -np.inf)
+    others = np.where(is_peak & (np.minimum(turn, 90 - turn) >= 6), curve, -np.inf)
     return others if num_points >= 30 and others.max() > curve.max() - max_loss else curve
 
 

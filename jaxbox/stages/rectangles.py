@@ -21,7 +21,7 @@ from jaxbox.xla.sorting import largest_first
 PREFERENCE_GAIN = 5.0
 """How often the scene's direction counts for the second candidate of a cluster: it bends a closeness only."""
 
-PEAKS_APART_DEG, MIN_PEAK_POINTS = 10.0, 30
+PEAKS_APART_DEG, MIN_PEAK_POINTS = 6.0, 30
 """A second peak differs by so much from the best rotation, and is looked for where a rectangle is fitted to
 so many points: to weigh it takes time."""
 
