@@ -66,6 +66,36 @@ def test_a_measurement_without_noise_is_believed_and_one_of_much_noise_is_not():
     np.testing.assert_allclose(np.concatenate(same), np.concatenate(start), atol=1e-5)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_an_outlier_lies_three_standard_deviations_off_and_others_are_believed(seed):
+    rng = np.random.default_rng(seed)
+    position, covariance = rng.normal(0, 5, (200, 2)), rng.uniform(0.01, 1, (200, 3))
+    variance, turn = rng.uniform(0.01, 1, 200), rng.uniform(-np.pi, np.pi, 200)
+    sds = np.where(np.arange(200) % 2, rng.uniform(0, 2.9, 200), rng.uniform(3.1, 40, 200))
+    spread = covariance[:, 0] + variance
+    gap = sds[:, None] * np.sqrt(spread)[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+    operands = (position, covariance, position + gap, variance)
+    raised = np.asarray(kalman.outlier_variance(*(np.float32(operand) for operand in operands)))
+    usual = sds < 3
+    np.testing.assert_array_equal(raised[usual], np.float32(variance[usual]))
+    left = np.sum(gap**2, axis=1) / (covariance[:, 0] + raised)
+    np.testing.assert_allclose(left[~usual], 9, rtol=1e-3)
+
+
+def test_one_box_metres_aside_does_not_throw_a_track():
+    """A car at 10 m/s whose box of one sweep is of its other face: 1.5 m behind."""
+    at = np.arange(12) * 1.0
+    at[8] -= 1.5
+    state = TrackerState.empty(1)
+    for k, x in enumerate(at):
+        seen = traffic.observations([[x, 5.0, 0.0]])
+        state, tracks = step(state, seen, 0.1, STAY)
+        if k >= 8:
+            assert int(tracks.id[0]) == 0
+            np.testing.assert_allclose(tracks.velocity[0], [10, 0], atol=1.0)
+    np.testing.assert_allclose(tracks.filtered_center[0, :2], [11, 5], atol=0.1)
+
+
 # Visibility.
 
 

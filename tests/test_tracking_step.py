@@ -141,7 +141,7 @@ def assert_parity(sweeps, num_slots, config=None, tolerance=TOLERANCE):
 @pytest.mark.parametrize(("dt", "num_slots"), [(0.1, NUM_SLOTS), (0.1, 11), (0.05, NUM_SLOTS), (0.37, 11)])
 def test_every_output_is_that_of_the_reference(dt, num_slots):
     met = set()
-    for seed in (3, 4):
+    for seed in (3, 7):
         met |= assert_parity(recording(seed, dt), num_slots)
     everything = {"SEEN", "HIDDEN", "COASTING", "matched", "births", "low_scores", "deaths"}
     everything |= {Motion.STANDING, Motion.MOVING, Motion.STARTING, Motion.STOPPING, Motion.TURNING}
@@ -300,14 +300,14 @@ def row_of(tree, index):
 
 
 def test_vmap_over_recordings_and_settings_is_each_by_itself():
-    sweeps = [recording(seed).sweep(slice(None)) for seed in (0, 1, 0)]
+    sweeps = [recording(seed).sweep(slice(None)) for seed in (3, 1, 3)]
     configs = [TrackConfig(), TrackConfig(), TrackConfig(gate=1.0)]
     stacked = jax.tree.map(lambda *rows: np.stack(rows), *sweeps)
     config = jax.tree.map(lambda *values: np.array(values, np.float32), *configs)
     together = jax.jit(jax.vmap(track_sequence, in_axes=(None, 0, 0, 0, 0)))
     state, tracks = together(start(), *stacked, config)
     assert int(state.next_id[0]) < int(state.next_id[2])
-    for index, seed in enumerate((0, 1, 0)):
+    for index, seed in enumerate((3, 1, 3)):
         one_state, one = run(recording(seed), config=configs[index])
         assert_same_tracks(one, row_of(tracks, index), atol=2e-5)
         chex.assert_trees_all_close(one_state, row_of(state, index), rtol=1e-6, atol=2e-5)

@@ -33,6 +33,8 @@ FIRST_INTERVAL_S = 0.1
 """What is taken for the time before the first sweep."""
 Z_GAIN, FIRST_Z_GAIN = 0.3, 0.5
 """Share of the difference that corrects the height of the centre, and that of the first detections."""
+OUTLIER_SDS = 3.0
+"""Positions farther from what is expected count as if they were less certain, so that they lie so far."""
 NUM_RAYS = 24
 """Azimuths over a box at which the nearest return is looked up."""
 
@@ -257,7 +259,9 @@ def learn(track: Track, seen: Any, row: int, dt: float, config: TrackConfig) -> 
     center, score = np.asarray(seen.center[row], float), float(seen.score[row])
     size = vehicle_shape.learn_shape(track, seen, row, dt, config)
     place = vehicle_shape.keep_visible_faces(center[:2], size, track.yaw, track.size()[:2])
-    correct(track, place, position_variance(center, config))
+    innovation = float(np.linalg.norm(place - track.position[:2]))
+    least = (innovation / OUTLIER_SDS) ** 2 - track.covariance[0, 0]
+    correct(track, place, max(position_variance(center, config), least))
     z_gain = Z_GAIN if track.hits > MATURE_HITS else FIRST_Z_GAIN
     track.position[2] += z_gain * (center[2] - track.position[2])
     vehicle_shape.vote_front(track)

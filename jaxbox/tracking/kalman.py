@@ -9,6 +9,9 @@ import jax.numpy as jnp
 
 from jaxbox.config import Scalar
 
+OUTLIER_SDS = 3.0
+"""A measured position that lies more standard deviations than this from the expected one is an outlier."""
+
 
 def predict_covariance(covariance: jax.Array, dt: jax.Array, acceleration_mps2: Scalar) -> jax.Array:
     """Covariance after a time at constant velocity with white acceleration.
@@ -31,6 +34,30 @@ def predict_covariance(covariance: jax.Array, dt: jax.Array, acceleration_mps2: 
         ],
         axis=-1,
     )
+
+
+def outlier_variance(
+    position: jax.Array, covariance: jax.Array, measured: jax.Array, variance: jax.Array
+) -> jax.Array:
+    """Variance of a measured position, raised for an outlier until it is none: d^2 = 9 for any beyond.
+
+    A box of another face, or of a part of a vehicle, may lie metres aside: taken at its word, it changes the
+    velocity by metres a second, and the track is lost. Raising the measurement's variance by its innovation
+    is the usual robust Kalman filter (Huber, 1964; Chang, 2014, doi:10.1007/s00190-013-0690-8).
+
+    Args:
+      position: (..., 2) float32, m, predicted.
+      covariance: (..., 3) float32, predicted.
+      measured: (..., 2) float32, m.
+      variance: (...) float32, m^2, of the measurement along each axis; positive.
+
+    Returns:
+      (...) float32, m^2: `variance`, or more.
+    """
+    gap = measured - position
+    distance_sq = gap[..., 0] ** 2 + gap[..., 1] ** 2
+    beyond = distance_sq / OUTLIER_SDS**2 - (covariance[..., 0] + variance)
+    return variance + jnp.maximum(beyond, 0)
 
 
 def update(

@@ -187,8 +187,10 @@ def _learn(slots: Slots, own: Observations, dt: jax.Array, config: TrackConfig) 
     flat = jnp.where(crossed[:, None], own.size[:, 1::-1], own.size[:, :2])
     size = shape.track_size(sized)[:, :2]
     center = shape.keep_visible_faces(own.center[:, :2], flat, turned.yaw, size)
+    variance = position_variance(own.center, config)
+    variance = kalman.outlier_variance(slots.position, slots.covariance, center, variance)
     position, velocity, covariance = kalman.update(
-        slots.position, slots.velocity, slots.covariance, center, position_variance(own.center, config)
+        slots.position, slots.velocity, slots.covariance, center, variance
     )
     moved = dataclasses.replace(sized, position=position, velocity=velocity, covariance=covariance)
     z_gain = jnp.where(slots.hits > shape.MATURE_HITS, Z_GAIN, FIRST_Z_GAIN)
