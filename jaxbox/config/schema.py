@@ -232,9 +232,9 @@ class BoxConfig:
     """static: A, rotations tried over 90 degrees."""
     fit_to: Literal["slab", "hull"] = _static(default="slab")
     """static: fit to points of the cluster between two heights, or to its convex hull (the paper)."""
-    max_points: int = _static(default=144)
-    """static: M, points of a cluster that the rectangle is fitted to; of more about .8 M, spread evenly by
-    their direction, the same in any order of the points."""
+    max_points: int = _static(default=160)
+    """static: M, points of a cluster that the rectangle is fitted to; of more than .9 M about .72 M, spread
+    evenly by their direction, the same in any order of the points."""
     max_slab_points: int | None = _static(default=None)
     """static: capacity for a map's points between the slab's heights; None is 1/8 of the cloud or, up to
     1/4 of it, 16,384."""

@@ -59,7 +59,7 @@ def find_clusters(obstacles: Obstacles, component_map: ComponentMap, config: Det
 
 
 def sampled_share(num_points: int, max_points: int) -> int:
-    """Up to which rank the points of a cluster are looked at: all of few, else about .8 max_points.
+    """Up to which rank the points of a cluster are looked at: all of few, else about .72 max_points.
 
     Args:
       num_points: of the cluster.
@@ -68,9 +68,9 @@ def sampled_share(num_points: int, max_points: int) -> int:
     Returns:
       In [0, NUM_RANKS].
     """
-    if num_points <= max_points:
+    if num_points <= round(0.9 * max_points):
         return NUM_RANKS
-    return round(0.8 * max_points) * NUM_RANKS // num_points
+    return round(0.72 * max_points) * NUM_RANKS // num_points
 
 
 def sampling_rank(xyz: np.ndarray) -> np.ndarray:

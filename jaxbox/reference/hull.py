@@ -38,8 +38,8 @@ def fit_points(members: np.ndarray, xyz: np.ndarray, height: np.ndarray, config:
       xyz: (n, 3) m, sensor frame, of all points.
       height: (n,) m above the ground, likewise.
       config: members between the slab's heights, both exclusive, are taken, unless they are too few, or too
-        small a share of all: then all are. Of more than `max_points` those of the lowest ranks, see
-        `sampling_rank`, and of these, where they are too many, `max_points` spread evenly: the
+        small a share of all: then all are. Of more than .9 `max_points` those of the lowest ranks, see
+        `sampling_rank`, and of these, where they are more than `max_points`, as many spread evenly: the
         floor(j count / max_points)-th.
 
     Returns:
