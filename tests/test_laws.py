@@ -65,7 +65,7 @@ def hull_of(xy):
 def _rectangle(rows, count):
     lists = PointLists(rows[:, 0], rows[:, 1], jnp.zeros(1, jnp.int32), count[None], NUM_POINTS)
     first = jnp.zeros(1, jnp.int32)
-    curve, extents = try_rotations(
+    curve, extents, _ = try_rotations(
         lists, first, jnp.int32(1), BoxConfig(criterion="area", num_angles=NUM_ANGLES)
     )
     return best_rectangles(curve, extents, jnp.zeros(NUM_ANGLES))

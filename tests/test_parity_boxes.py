@@ -56,6 +56,8 @@ def convex_hulls(points, valid, num_clusters):
 
 polygon_area = jax.jit(hull.polygon_area)
 try_rotations = parity.PerForm(rectangles.try_rotations)
+principal_rotations = parity.PerForm(rectangles.principal_rotations, static_argnums=1)
+along_axis = parity.PerForm(rectangles.along_axis, static_argnums=3)
 count_votes = parity.PerForm(direction.count_votes)
 point_moments = parity.PerForm(descriptors.point_moments)
 shape_descriptors = jax.jit(descriptors.shape_descriptors)
@@ -326,7 +328,7 @@ def test_the_second_peak_of_a_curve_is_far_from_the_best_and_nearly_as_good(plat
 def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, criterion):
     config = dataclasses.replace(SETTINGS, criterion=criterion)
     points, count, fits = fits_of(cases)
-    curves, extents = try_rotations(*fits, config)
+    curves, extents, _ = try_rotations(*fits, config)
     best = rectangles.best_rectangles(curves, extents, jnp.zeros(SETTINGS.num_angles))
     angle, low, high = (np.asarray(values) for values in (best.angle, best.low, best.high))
     curves, extents = np.asarray(curves).T, np.stack(extents).transpose(2, 1, 0)
@@ -349,7 +351,7 @@ def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, cr
 @pytest.mark.usefixtures("platform")
 def test_smallest_area_is_that_of_opencv_within_the_bound_of_the_step(cases):
     points, count, fits = fits_of(cases)
-    curve, _ = try_rotations(*fits, dataclasses.replace(SETTINGS, criterion="area"))
+    curve, *_ = try_rotations(*fits, dataclasses.replace(SETTINGS, criterion="area"))
     step = math.pi / 2 / SETTINGS.num_angles
     for k in range(len(count)):
         _, (length, width), _ = reference.min_area_rectangle(points[k, : count[k]])
@@ -365,11 +367,60 @@ def test_a_cluster_without_points_has_no_extents_and_a_finite_curve(criterion):
     x, y = jnp.array([1.0, 2, 3]), jnp.array([1.0, 1, 2])
     lists = PointLists(x, y, start=jnp.array([0, 3]), total=jnp.array([3, 0]), max_points=16)
     config = dataclasses.replace(SETTINGS, criterion=criterion, num_angles=6)
-    curve, extents = try_rotations(lists, jnp.arange(2), jnp.int32(2), config)
+    curve, extents, principal = try_rotations(lists, jnp.arange(2), jnp.int32(2), config)
     u0, u1, v0, v1 = extents
     assert np.isfinite(curve).all()
+    assert principal[1] == 0
     np.testing.assert_array_equal([(u1 - u0)[0, 0], (v1 - v0)[0, 0]], [2, 1])
     np.testing.assert_array_equal(np.stack(extents)[:, :, 1], 0)
+
+
+@pytest.mark.usefixtures("platform")
+def test_principal_rotations_are_those_of_the_reference(cases):
+    points, count, fits = fits_of(cases)
+    ours = np.asarray(try_rotations(*fits, SETTINGS)[2])
+    off = []
+    for k in np.flatnonzero(count >= 3):
+        xy = points[k, : count[k]].astype(float)
+        moments = np.linalg.eigvalsh(np.cov(xy.T))
+        # Points as far across as along have no principal axis.
+        if moments[0] < 0.8 * moments[1]:
+            turn = abs(ours[k] - reference.principal_rotation(xy, SETTINGS.num_angles))
+            off.append(min(turn, SETTINGS.num_angles - turn))
+    assert len(off) > 100
+    assert max(off) <= 1
+    # A direction halfway between two rotations may round to either.
+    assert np.mean(off) < 5e-3
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("yaw_deg", [0, 1, 33.4, 45, 71, 89, 89.8])
+def test_the_principal_rotation_of_what_is_symmetric_is_its_axis(yaw_deg):
+    rng = np.random.default_rng(0)
+    # A rounded front, both halves alike, somewhere, with more or less noise.
+    across = np.linspace(-0.8, 0.8, 60)
+    front = np.stack([-0.6 * across**2, across], axis=1)
+    yaw = np.radians(yaw_deg)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    for noise_m in (0, 0.02):
+        xy = (front + rng.normal(0, noise_m, front.shape)) @ turn.T + [-12, 3]
+        table = xy.T[..., None].astype(np.float32), np.array([len(xy)], np.int32)
+        rotation = int(principal_rotations((*table[0], table[1]), 90)[0])
+        assert abs((rotation - yaw_deg + 45) % 90 - 45) <= (0.51 if noise_m == 0 else 1.5)
+
+
+def test_many_points_are_tried_along_their_axis_where_it_is_apart_from_the_best_rotation(platform):
+    rng = np.random.default_rng(0)
+    best, principal, num_points = rng.integers(0, [90, 90, 160], (300, 3)).astype(np.int32).T
+    ours = np.asarray(along_axis(best, principal, num_points, 90, np.float32(80)))
+    for rotation, *row in zip(ours.tolist(), best, principal, num_points, strict=True):
+        curve = -np.abs(np.arange(90.0) - row[0])
+        rotations = reference.Rotations(curve, np.zeros((90, 4)), int(row[2]), int(row[1]))
+        assert rotation == reference.along_axis(rotations, dataclasses.replace(SETTINGS, min_axis_points=80))
+    turn = np.abs(ours - best)
+    assert (num_points[ours != best] >= 80).all()
+    assert (np.minimum(turn, 90 - turn)[ours != best] >= 5).all()
+    assert 80 < (ours != best).sum() < 160
 
 
 @pytest.mark.usefixtures("platform")

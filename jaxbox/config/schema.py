@@ -259,9 +259,12 @@ class BoxConfig:
     """Boxes with a shorter longest extent do not vote."""
     direction_max_free: Scalar = 0.15
     """Boxes with a larger part of their area seen to be free do not vote."""
-    second_peak_loss: Scalar = 0.05
+    second_peak_loss: Scalar = 0.07
     """A cluster is also tried at a second peak of its closeness where that is lower by less than this;
     0 tries none. See ``completion.along_scene``."""
+    min_axis_points: Scalar = 80.0
+    """A cluster with so many fitted points or more is also tried along their principal axis; see
+    ``completion.along_scene``."""
 
 
 @config_class
@@ -273,7 +276,8 @@ class CompletionConfig:
     sensor; or let the evidence choose among hypotheses."""
     along_scene: bool = _static(default=True)
     """static: let the evidence choose among the rectangle at the best rotation, one that fits nearly as
-    well, and that along the scene's direction, instead of one in between; needs ``box.scene_direction``."""
+    well, that along the scene's direction, and one along the principal axis of the points, instead of one in
+    between; needs ``box.scene_direction``."""
     seen_length: Scalar = 0.72
     """A side measured at least this long, as a fraction of the class's length, may be seen whole."""
     seen_width: Scalar = 0.83
@@ -297,7 +301,7 @@ class CompletionConfig:
     """static: rays over the box when hypotheses are compared."""
     num_final_rays: int = _static(default=48)
     """static: rays over the box for its score."""
-    free_weight: Scalar = 1.0
+    free_weight: Scalar = 0.85
     """Cost of the fraction of rays that pass through."""
     free_length_weight: Scalar = 2.0
     """Cost of the fraction of the box's area seen to be free."""

@@ -26,7 +26,10 @@ def fit_rectangles(outlines: Sequence[np.ndarray], config: BoxConfig) -> list[Ro
     Returns:
       The rectangles of each cluster.
     """
-    return [Rotations(*try_rotations(xy, config), len(xy)) for xy in outlines]
+    return [
+        Rotations(*try_rotations(xy, config), len(xy), principal_rotation(xy, config.num_angles))
+        for xy in outlines
+    ]
 
 
 def best_rectangles(
@@ -43,12 +46,24 @@ def best_rectangles(
       The rectangles; of equally good rotations the first.
     """
 
-    def best_of(rotations: Rotations) -> Rectangle:
-        best = int(np.argmax(rotations.curve + gain * preference))
-        score = float(rotations.curve[best] + preference[best])
-        return Rectangle(rotations.extents[best], best * np.pi / 2 / len(preference), score)
+    return [
+        rectangle_at(int(np.argmax(each.curve + gain * preference)), each, preference) for each in rotations
+    ]
 
-    return [best_of(each) for each in rotations]
+
+def rectangle_at(index: int, rotations: Rotations, preference: np.ndarray) -> Rectangle:
+    """The rectangle of a cluster at a rotation.
+
+    Args:
+      index: in [0, A).
+      rotations: of the cluster.
+      preference: (A,), added to the score.
+
+    Returns:
+      The rectangle.
+    """
+    score = float(rotations.curve[index] + preference[index])
+    return Rectangle(rotations.extents[index], index * np.pi / 2 / len(preference), score)
 
 
 def rectangle_candidates(
@@ -63,7 +78,8 @@ def rectangle_candidates(
 
     Returns:
       Those at the best rotation, bent to the scene's direction; where the preset asks, those that know
-      nothing of it, those that keep to it, and those at a second peak of the curve: a list each.
+      nothing of it, those that keep to it, those at a second peak of the curve, and those along the
+      principal axis of the points: a list each.
     """
     along_scene = config.box.scene_direction and config.completion.along_scene
     if not along_scene:
@@ -78,7 +94,41 @@ def rectangle_candidates(
         best_rectangles(rotations, preference, gain=0),
         best_rectangles(rotations, preference, gain=PREFERENCE_GAIN),
         best_rectangles(second, preference, gain=0),
+        [rectangle_at(along_axis(each, config.box), each, preference) for each in rotations],
     ]
+
+
+def principal_rotation(xy: np.ndarray, num_angles: int) -> int:
+    """The rotation nearest to the principal axes of points, about which their moments of inertia differ most.
+
+    Args:
+      xy: (n, 2) m, n >= 1.
+      num_angles: A.
+
+    Returns:
+      i in [0, A), of i * 90 / A degrees.
+    """
+    _, axes = np.linalg.eigh(np.cov(xy.T, bias=True).reshape(2, 2))
+    turn_deg = np.degrees(np.arctan2(axes[1, 1], axes[0, 1])) % 90
+    return round(turn_deg * num_angles / 90) % num_angles
+
+
+def along_axis(rotations: Rotations, config: BoxConfig) -> int:
+    """The rotation along the principal axes of a cluster, or its best rotation.
+
+    Args:
+      rotations: of the cluster.
+      config: the principal axes are tried of `min_axis_points` or more, where they are 5 degrees or more
+        from the best rotation.
+
+    Returns:
+      In [0, A).
+    """
+    best, num_angles = int(np.argmax(rotations.curve)), len(rotations.curve)
+    turn = abs(rotations.principal - best)
+    apart_deg = min(turn, num_angles - turn) * 90 / num_angles
+    is_tried = rotations.num_points >= config.min_axis_points and apart_deg >= 5
+    return rotations.principal if is_tried else best
 
 
 def second_peak(curve: np.ndarray, num_points: int, *, max_loss: float) -> np.ndarray:

@@ -95,6 +95,8 @@ class Rotations:
     """(A, 4) m: smallest and largest u, smallest and largest v, see `try_rotations`."""
     num_points: int
     """How many points they were fitted to."""
+    principal: int
+    """The rotation along the principal axes of the points, see `principal_rotation`."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -33,8 +33,8 @@ MIN_RANGE_M = 0.1
 """Nearer points are ranked as if at this range: their slope has no bound."""
 
 SAMPLED_FROM, SAMPLED_SHARE = 0.9, 0.72
-"""Of clusters with more points than this share of `max_points` so much of it is looked at in the mean. The room
-left is for those that have more than their share: no cluster of 83 real sweeps needs a third of it."""
+"""Of clusters with more points than this share of `max_points` so much of it is looked at in the mean. The
+rest is room for those that have more than their share: no cluster of 83 real sweeps needs all of it."""
 
 
 def propose_clusters(obstacles: Obstacles, config: DetectorConfig) -> Clusters:

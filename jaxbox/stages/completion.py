@@ -77,7 +77,7 @@ def complete_boxes(
     """The completed box of every class hypothesis.
 
     Args:
-      candidates: rectangles (P,) of the clusters, one or three of each.
+      candidates: rectangles (P,) of the clusters, one or four of each.
       points: that those were fitted to.
       clusters: of P rows.
       cast_rays: asks the evidence; None where there is none.

@@ -178,6 +178,8 @@ class Rotations:
     """(P,) int32: how many points the rectangles were fitted to; likewise."""
     place: jax.Array
     """(P,) int32: where each cluster is in those."""
+    principal: jax.Array
+    """(P,) int32: the rotation along the principal axes of the points; likewise."""
 
 
 @jax.tree_util.register_dataclass
