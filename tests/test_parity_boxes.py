@@ -385,7 +385,7 @@ def test_principal_rotations_are_those_of_the_reference(cases):
         moments = np.linalg.eigvalsh(np.cov(xy.T))
         # Points as far across as along have no principal axis.
         if moments[0] < 0.8 * moments[1]:
-            turn = abs(ours[k] - reference.principal_rotation(xy, SETTINGS.num_angles))
+            turn = abs(ours[k] - reference.principal_rotations([xy], SETTINGS.num_angles)[0])
             off.append(min(turn, SETTINGS.num_angles - turn))
     assert len(off) > 100
     assert max(off) <= 1

@@ -26,9 +26,10 @@ def fit_rectangles(outlines: Sequence[np.ndarray], config: BoxConfig) -> list[Ro
     Returns:
       The rectangles of each cluster.
     """
+    principal = principal_rotations(outlines, config.num_angles)
     return [
-        Rotations(*try_rotations(xy, config), len(xy), principal_rotation(xy, config.num_angles))
-        for xy in outlines
+        Rotations(*try_rotations(xy, config), len(xy), along)
+        for xy, along in zip(outlines, principal, strict=True)
     ]
 
 
@@ -46,24 +47,28 @@ def best_rectangles(
       The rectangles; of equally good rotations the first.
     """
 
-    return [
-        rectangle_at(int(np.argmax(each.curve + gain * preference)), each, preference) for each in rotations
-    ]
+    best = [int(np.argmax(each.curve + gain * preference)) for each in rotations]
+    return rectangles_at(best, rotations, preference)
 
 
-def rectangle_at(index: int, rotations: Rotations, preference: np.ndarray) -> Rectangle:
-    """The rectangle of a cluster at a rotation.
+def rectangles_at(
+    index: Sequence[int], rotations: Sequence[Rotations], preference: np.ndarray
+) -> list[Rectangle]:
+    """The rectangle of each cluster at a rotation.
 
     Args:
-      index: in [0, A).
-      rotations: of the cluster.
-      preference: (A,), added to the score.
+      index: in [0, A), of each.
+      rotations: of the clusters.
+      preference: (A,), added to the scores.
 
     Returns:
-      The rectangle.
+      The rectangles.
     """
-    score = float(rotations.curve[index] + preference[index])
-    return Rectangle(rotations.extents[index], index * np.pi / 2 / len(preference), score)
+    step = np.pi / 2 / len(preference)
+    return [
+        Rectangle(each.extents[i], i * step, float(each.curve[i] + preference[i]))
+        for i, each in zip(index, rotations, strict=True)
+    ]
 
 
 def rectangle_candidates(
@@ -94,23 +99,27 @@ def rectangle_candidates(
         best_rectangles(rotations, preference, gain=0),
         best_rectangles(rotations, preference, gain=PREFERENCE_GAIN),
         best_rectangles(second, preference, gain=0),
-        [rectangle_at(along_axis(each, config.box), each, preference) for each in rotations],
+        rectangles_at([along_axis(each, config.box) for each in rotations], rotations, preference),
     ]
 
 
-def principal_rotation(xy: np.ndarray, num_angles: int) -> int:
-    """The rotation nearest to the principal axes of points, about which their moments of inertia differ most.
+def principal_rotations(outlines: Sequence[np.ndarray], num_angles: int) -> list[int]:
+    """The rotations along the principal axes of clusters, about which their moments of inertia differ most.
 
     Args:
-      xy: (n, 2) m, n >= 1.
+      outlines: (n, 2) m, the points of each cluster, n >= 1.
       num_angles: A.
 
     Returns:
-      i in [0, A), of i * 90 / A degrees.
+      i in [0, A) of each, the nearest of the rotations by i * 90 / A degrees.
     """
-    _, axes = np.linalg.eigh(np.cov(xy.T, bias=True).reshape(2, 2))
-    turn_deg = np.degrees(np.arctan2(axes[1, 1], axes[0, 1])) % 90
-    return round(turn_deg * num_angles / 90) % num_angles
+
+    def along(xy: np.ndarray) -> int:
+        _, axes = np.linalg.eigh(np.cov(xy.T, bias=True))
+        turn_deg = np.degrees(np.arctan2(axes[1, 1], axes[0, 1])) % 90
+        return round(turn_deg * num_angles / 90) % num_angles
+
+    return [along(xy) for xy in outlines]
 
 
 def along_axis(rotations: Rotations, config: BoxConfig) -> int:

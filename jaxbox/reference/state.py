@@ -96,7 +96,7 @@ class Rotations:
     num_points: int
     """How many points they were fitted to."""
     principal: int
-    """The rotation along the principal axes of the points, see `principal_rotation`."""
+    """The rotation along the principal axes of the points, see `principal_rotations`."""
 
 
 @dataclasses.dataclass(frozen=True)

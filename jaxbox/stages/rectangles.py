@@ -212,7 +212,7 @@ def principal_rotations(clusters: PointTable, num_angles: int) -> jax.Array:
     Returns:
       (C,) int32, in [0, A): the nearest of the rotations by i * 90 / A degrees; 0 without points.
 
-    Reference: paper, section 3.5 (moment of inertia); oracle `jaxbox.reference.principal_rotation`.
+    Reference: paper, section 3.5 (moment of inertia); oracle `jaxbox.reference.principal_rotations`.
     """
     x, y, count = clusters
     valid = jnp.arange(x.shape[0], dtype=jnp.int32)[:, None] < count[None]
