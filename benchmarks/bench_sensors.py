@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import common
-from jaxbox import Detections, DetectorConfig
+from jaxbox import Detections, DetectorConfig, Label
 from jaxbox.cli.report import SHOWN_MIN_SCORE
 from jaxbox.evaluation import count_points_in_boxes, matching, pairwise_overlaps
 from jaxbox.evaluation.copies import COPIES, Copy, turn_back, turn_points
@@ -136,6 +136,7 @@ def _detections(found: Detections, judged: np.ndarray, best: np.ndarray, right: 
     score, reach = np.asarray(found.score)[valid], np.hypot(*np.asarray(found.center)[valid, :2].T)
     return {
         "score": score[judged].tolist(),
+        "label": np.asarray(found.label)[valid][judged].tolist(),
         "range_m": reach[judged].tolist(),
         "best_overlap": best[judged].tolist(),
         "right": right[judged].tolist(),
@@ -239,7 +240,9 @@ def cut_rows(
 def _nearer(sweep: Mapping[str, Any], max_range_m: float) -> dict[str, Any]:
     """The sweep without its farther detections."""
     near = np.asarray(sweep["range_m"]) <= max_range_m
-    lists = {key: np.asarray(sweep[key])[near] for key in ("score", "range_m", "best_overlap", "right")}
+    lists = {
+        key: np.asarray(sweep[key])[near] for key in ("score", "label", "range_m", "best_overlap", "right")
+    }
     return {**sweep, **lists}
 
 
@@ -307,7 +310,26 @@ def pool(summaries: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """All data sets together: the table by cut, and the cut that it chooses."""
     measured = [sweep for summary in summaries.values() for sweep in summary["sweeps"]]
     rows = cut_rows(measured, {"": lambda sweep: sweep["right"]})
-    return {"cuts": rows, "chosen_cut": choose_cut(rows), "library_cut": SHOWN_MIN_SCORE}
+    return {
+        "cuts": rows,
+        "chosen_cut": choose_cut(rows),
+        "library_cut": SHOWN_MIN_SCORE,
+        "classes": right_by_class(measured),
+    }
+
+
+def right_by_class(measured: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
+    """Boxes of each class from the library's cut on, and how many of them are right: on a vehicle of any."""
+    score, label, right = (
+        np.concatenate([np.zeros(0, int), *(np.asarray(sweep[key]) for sweep in measured)])
+        for key in ("score", "label", "right")
+    )
+    shown = score >= SHOWN_MIN_SCORE
+    of_class = {kind: shown & (label == kind) for kind in Label}
+    return {
+        kind.name.lower(): {"boxes": int(rows.sum()), "right": int(right[rows].sum())}
+        for kind, rows in of_class.items()
+    }
 
 
 def print_summary(name: str, summary: Mapping[str, Any]) -> None:
@@ -344,6 +366,8 @@ def print_pool(pooled: Mapping[str, Any]) -> None:
         )
     if SHOWN_MIN_SCORE in precision:
         print(f"the default cut is {SHOWN_MIN_SCORE}: pooled precision {precision[SHOWN_MIN_SCORE]:.3f}")
+    by_class = (f"{name} {count['right']} of {count['boxes']}" for name, count in pooled["classes"].items())
+    print(f"right of the boxes of each class, from there on: {', '.join(by_class)}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

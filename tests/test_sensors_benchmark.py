@@ -27,6 +27,7 @@ def detections(xy, scores, owner=()):
     return types.SimpleNamespace(
         valid=valid,
         score=np.array([*scores, 0.0]),
+        label=np.zeros(len(valid), np.int32),
         center=center,
         size=np.tile(CAR_SIZE, (len(valid), 1)),
         yaw=np.zeros(len(valid)),
@@ -105,6 +106,19 @@ def test_right_and_false_detections_of_a_cut_are_all_of_them(bench):
             row["detections_per_sweep"]
         )
         assert row["recall_cars"] is None
+
+
+def test_right_boxes_are_counted_under_what_they_are_called_from_the_library_cut_on(bench):
+    sweeps = [
+        {"score": [0.9, 0.2, 0.14], "label": [0, 2, 2], "right": [True, False, True]},
+        {"score": [0.15, 0.3], "label": [2, 0], "right": [True, False]},
+        {"score": [], "label": [], "right": []},
+    ]
+    assert bench.right_by_class(sweeps) == {
+        "car": {"boxes": 2, "right": 1},
+        "van": {"boxes": 0, "right": 0},
+        "truck": {"boxes": 2, "right": 1},
+    }
 
 
 def test_the_chosen_cut_is_the_smallest_that_is_precise_enough(bench):

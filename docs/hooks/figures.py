@@ -188,6 +188,14 @@ def cuts() -> str:
     return table(list(rows[0]), [list(row.values()) for row in rows])
 
 
+def sensor_classes() -> str:
+    """Boxes of each class, and how many are right, with other sensors."""
+    rows = [
+        (name, count["boxes"], count["right"]) for name, count in load("sensors")["pooled"]["classes"].items()
+    ]
+    return table(["called", "boxes", "right"], rows)
+
+
 def ground() -> str:
     """F1 by data set and method."""
     report = load("ground")
@@ -766,6 +774,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "paper": paper_table,
     "sensors": sensors,
     "cuts": cuts,
+    "sensor_classes": sensor_classes,
     "ground": ground,
     "speed": speed,
     "gpu": gpu,
