@@ -53,7 +53,7 @@ def complete_boxes(
     """The completed box of every class hypothesis that has one.
 
     Args:
-      candidates: rectangles of the clusters, one to three lists of them.
+      candidates: rectangles of the clusters, one or four lists of them.
       outlines: (n, 2) m, the points that those were fitted to.
       clusters: of all maps.
       evidence: of the sweep, or None.
@@ -93,7 +93,7 @@ def sides_in_rows(
 
     Args:
       clusters: those that may be of the class.
-      candidates: rectangles of all clusters, one to three lists of them.
+      candidates: rectangles of all clusters, one or four lists of them.
       prior: of the class.
       config: of the rows.
 
