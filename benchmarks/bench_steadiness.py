@@ -94,13 +94,15 @@ class Tally:
         }
 
 
-def measure_boxes(config: DetectorConfig, sweeps: Sequence[Sweep], draws: int, show: bool) -> dict[str, Any]:
+def measure_boxes(
+    config: DetectorConfig, sweeps: Sequence[Sweep], draws: range, show: bool
+) -> dict[str, Any]:
     """The shares of the boxes of single sweeps, by change."""
     tallies = {change: Tally() for change in CHANGES}
     for sweep in sweeps:
         before = rows_of(common.detect(changed(sweep, "", 0), None, config))
         for change, tally in tallies.items():
-            for draw in range(draws):
+            for draw in draws:
                 after = rows_of(common.detect(changed(sweep, change, draw), None, config))
                 stay, found = judge(before, after)
                 tally.add(before, stay, found)
@@ -109,14 +111,14 @@ def measure_boxes(config: DetectorConfig, sweeps: Sequence[Sweep], draws: int, s
     return {change: tally.to_dict() for change, tally in tallies.items()}
 
 
-def measure_tracks(config: DetectorConfig, draws: int, limit: int | None) -> dict[str, Any]:
+def measure_tracks(config: DetectorConfig, draws: range, limit: int | None) -> dict[str, Any]:
     """The shares of the boxes of each sweep's tracks, by change."""
     root = common.data_folder("kitti_tracking") / "training"
     tallies = {change: Tally() for change in CHANGES}
     for _, sweeps in group_sequences(open_sweeps(root)):
         chosen = sweeps[:limit]
         before = list(track_boxes(chosen, config, "", 0))
-        for change, draw in itertools.product(CHANGES, range(draws)):
+        for change, draw in itertools.product(CHANGES, draws):
             for rows, after in zip(before, track_boxes(chosen, config, change, draw), strict=True):
                 tallies[change].add(rows, *judge(rows, after))
     return {change: tally.to_dict() for change, tally in tallies.items()}
@@ -150,13 +152,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--draws", type=common.at_least(1), default=20, help="changed copies of a sweep and a change"
     )
+    parser.add_argument(
+        "--first-draw", type=common.at_least(0), default=0, help="other noise than that of the record"
+    )
     parser.add_argument("--lost", action="store_true", help="print boxes from score .3 on that do not stay")
     options = parser.parse_args(arguments)
     config = common.chosen_config(options)
     sweeps = [sweep for name in FRAMES for sweep in open_sweeps(common.data_folder(name))]
-    draws, limit = (1, 8) if options.quick else (options.draws, None)
+    num_draws, limit = (1, 8) if options.quick else (options.draws, None)
+    draws = range(options.first_draw, options.first_draw + num_draws)
     sweeps = sweeps[:: len(sweeps) // 4] if options.quick else sweeps
-    report: dict[str, Any] = {"num_sweeps": len(sweeps), "num_draws": draws}
+    report: dict[str, Any] = {"num_sweeps": len(sweeps), "num_draws": num_draws}
     if "boxes" in options.parts:
         report["boxes"] = measure_boxes(config, sweeps, draws, options.lost)
     if "tracks" in options.parts:
