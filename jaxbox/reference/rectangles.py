@@ -134,10 +134,15 @@ def along_axis(rotations: Rotations, config: BoxConfig) -> int:
       In [0, A).
     """
     best, num_angles = int(np.argmax(rotations.curve)), len(rotations.curve)
-    turn = abs(rotations.principal - best)
-    apart_deg = min(turn, num_angles - turn) * 90 / num_angles
+    apart_deg = _apart_deg(rotations.principal, best, num_angles)
     is_tried = rotations.num_points >= config.min_axis_points and apart_deg >= 5
     return rotations.principal if is_tried else best
+
+
+def _apart_deg(first: int | np.ndarray, second: int, num_angles: int) -> np.ndarray:
+    """Degrees between two rotations, which repeat every quarter turn."""
+    turn = np.abs(first - second)
+    return np.minimum(turn, num_angles - turn) * 90 / num_angles
 
 
 def second_peak(curve: np.ndarray, num_points: int, *, max_loss: float) -> np.ndarray:
@@ -151,9 +156,9 @@ def second_peak(curve: np.ndarray, num_points: int, *, max_loss: float) -> np.nd
     Returns:
       (A,); the curve itself of less than 30 points, or where no peak farther comes so near to the best.
     """
-    turn = np.abs(np.arange(len(curve)) - np.argmax(curve)) * 90 / len(curve)
+    apart_deg = _apart_deg(np.arange(len(curve)), int(np.argmax(curve)), len(curve))
     is_peak = curve >= np.maximum(np.roll(curve, 1), np.roll(curve, -1))
-    others = np.where(is_peak & (np.minimum(turn, 90 - turn) >= 6), curve, -np.inf)
+    others = np.where(is_peak & (apart_deg >= 6), curve, -np.inf)
     return others if num_points >= 30 and others.max() > curve.max() - max_loss else curve
 
 

@@ -134,10 +134,15 @@ def along_axis(
 
     Reference: oracle `jaxbox.reference.along_axis`.
     """
-    turn = jnp.abs(principal - best)
-    apart_deg = jnp.minimum(turn, num_angles - turn).astype(jnp.float32) * (90 / num_angles)
+    apart_deg = _apart_deg(principal, best, num_angles)
     is_tried = (num_points.astype(jnp.float32) >= min_points) & (apart_deg >= AXIS_APART_DEG)
     return jnp.where(is_tried, principal, best)
+
+
+def _apart_deg(first: jax.Array, second: jax.Array, num_angles: int) -> jax.Array:
+    """Degrees between two rotations, which repeat every quarter turn."""
+    turn = jnp.abs(first - second)
+    return jnp.minimum(turn, num_angles - turn).astype(jnp.float32) * (90 / num_angles)
 
 
 def second_peak(curve: jax.Array, num_points: jax.Array, *, max_loss: Scalar) -> jax.Array:
@@ -158,8 +163,7 @@ def second_peak(curve: jax.Array, num_points: jax.Array, *, max_loss: Scalar) ->
     """
     num_angles = curve.shape[0]
     best, greatest = first_argmax(curve)
-    turn = jnp.abs(jnp.arange(num_angles, dtype=jnp.int32)[:, None] - best[None])
-    apart_deg = jnp.minimum(turn, num_angles - turn).astype(jnp.float32) * (90 / num_angles)
+    apart_deg = _apart_deg(jnp.arange(num_angles, dtype=jnp.int32)[:, None], best[None], num_angles)
     is_peak = (curve >= jnp.roll(curve, 1, axis=0)) & (curve >= jnp.roll(curve, -1, axis=0))
     others = jnp.where(is_peak & (apart_deg >= PEAKS_APART_DEG), curve, -jnp.inf)
     has_other = (num_points >= MIN_PEAK_POINTS) & (jnp.max(others, axis=0) > greatest - max_loss)
