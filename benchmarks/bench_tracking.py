@@ -9,9 +9,11 @@ one threshold is chosen on the nine others.
     python -m benchmarks.bench_tracking --parts real
 
 Chosen on these drives too, the real ones among them, are the share of a side that counts as seen (.8), the
-correlation of profiles (.15), the score of what is not seen (``unseen_sd_m``), the second pass's memory of
-heights (.2 s) and belief in few detections (4), and that it shows the track's own box of what moves. The
-settings for the trained detector's boxes were chosen on all ten sequences; only the threshold leaves one out.
+correlation of profiles (.15), the score of what is not seen (``unseen_sd_m``), what the track's box counts
+next to the sweep's (.5), the doubt in few detections (.5) and in those that jump (1.2 m), the second pass's
+memory of heights (.2 s) and belief in few detections (4), and that it shows the track's own box of what
+moves. The settings for the trained detector's boxes were chosen on all ten sequences; only the threshold
+leaves one out.
 """
 
 import argparse

@@ -619,9 +619,11 @@ def test_every_status_bit_says_what_happened():
 
 def test_scores_labels_and_ages_are_those_of_the_detections():
     score, label = np.full(traffic.CAPACITY, 0.9), np.zeros(traffic.CAPACITY)
-    state, _ = step(start(), cars(PLACES, score=score, label=label), 0.1, STAY)
+    state, before = step(start(), cars(PLACES, score=score, label=label), 0.1, STAY)
     _, tracks = step(state, cars(PLACES[:1], score=score / 3, label=label + 2), 0.1, STAY)
-    assert tracks.score[0] == pytest.approx(np.sqrt(0.3 * 0.6), abs=1e-6)
+    assert tracks.score[0] == pytest.approx((0.9 + 0.3) / 2.5, abs=1e-6)
+    # What is seen once may be chance.
+    assert before.score[0] == pytest.approx(0.9 / 1.5, abs=1e-6)
     assert tracks.label[0] == 0
     shares = np.zeros(tracks.label_probability.shape[1])
     shares[[0, 2]] = 0.75, 0.25
@@ -642,9 +644,43 @@ def test_what_is_not_seen_scores_less_the_less_its_place_is_known():
     expected = [mean * np.exp(-((sd_m / TrackConfig().unseen_sd_m) ** 2)) for sd_m in sds_m]
     np.testing.assert_allclose(scores[1:], expected, rtol=1e-5)
     assert (np.diff(scores, axis=0) < 0).all()
-    # Seen again, it scores as its detections do.
+    # Seen again, it scores as its detections do: of three of them more than of two.
     _, tracks = step(state, cars(PLACES), 0.1, STAY)
-    np.testing.assert_allclose(tracks.score[:3], mean, rtol=1e-6)
+    np.testing.assert_allclose(tracks.score[:3], mean * (3 / 3.5) / (2 / 2.5), rtol=1e-5)
+
+
+def test_a_weak_box_hardly_moves_a_vehicle_that_is_known():
+    state = start()
+    for _ in range(8):
+        state, before = step(state, cars(PLACES), 0.1, STAY)
+    aside = np.add(PLACES, [0.0, 1.0])
+    shifts, scores = [], []
+    for score in (0.01, 0.2, 0.8):
+        _, tracks = step(state, cars(aside, score=np.full(traffic.CAPACITY, score)), 0.1, STAY)
+        assert tracks.id[:3].tolist() == [0, 1, 2]
+        shift = np.linalg.norm(tracks.center[:3, :2] - before.center[:3, :2], axis=1)
+        assert (shift <= 1 + 1e-5).all()
+        shifts.append(shift)
+        scores.append(tracks.score[:3])
+    assert np.max(shifts[0]) < 0.4
+    assert np.min(shifts[2]) > 0.6
+    assert (np.diff(shifts, axis=0) > 0).all()
+    # One weak detection of nine costs no more than its share, and less than not to be seen at all would.
+    assert (np.diff(scores, axis=0) > 0).all()
+    assert (scores[0] >= before.score[:3] * 8.5 / 9.5 - 1e-6).all()
+
+
+def test_what_jumps_scores_less_than_what_moves_as_expected():
+    rng = np.random.default_rng(0)
+    state, ways = start(), np.zeros((3, 2))
+    for k in range(20):
+        # The first drives at 10 m/s, the second stands, the third jumps by decimetres to any side.
+        ways[0] = k * 1.0, 0.0
+        ways[2] = rng.choice([-0.3, 0.3], 2)
+        state, tracks = step(state, cars(PLACES + ways), 0.1, STAY)
+    assert tracks.id[:3].tolist() == [0, 1, 2]
+    np.testing.assert_allclose(tracks.score[:2], tracks.score[1], rtol=0.01)
+    assert tracks.score[2] < 0.8 * tracks.score[1]
 
 
 def test_a_low_score_keeps_a_track_alive_but_begins_none():

@@ -33,6 +33,10 @@ FIRST_INTERVAL_S = 0.1
 """What is taken for the time before the first sweep."""
 Z_GAIN, FIRST_Z_GAIN = 0.3, 0.5
 """Share of the difference that corrects the height of the centre, and that of the first detections."""
+EXPECTED_WITHIN_M = 1.2
+"""A detection so far from where its track was expected supports it by exp(-1) of its score."""
+DOUBTED_HITS = 0.5
+"""So many detections of score 0 are counted with those of each track: what is seen once may be chance."""
 OUTLIER_SDS = 3.0
 """Positions farther from what is expected count as if they were less certain, so that they lie so far."""
 NUM_RAYS = 24
@@ -260,13 +264,15 @@ def learn(track: Track, seen: Any, row: int, dt: float, config: TrackConfig) -> 
     size = vehicle_shape.learn_shape(track, seen, row, dt, config)
     place = vehicle_shape.keep_visible_faces(center[:2], size, track.yaw, track.size()[:2])
     innovation = float(np.linalg.norm(place - track.position[:2]))
+    knows_velocity = track.hits >= MATURE_HITS
+    agreement = math.exp(-((innovation / EXPECTED_WITHIN_M) ** 2)) if knows_velocity else 1.0
     least = (innovation / OUTLIER_SDS) ** 2 - track.covariance[0, 0]
     correct(track, place, max(position_variance(center, config), least))
     z_gain = Z_GAIN if track.hits > MATURE_HITS else FIRST_Z_GAIN
     track.position[2] += z_gain * (center[2] - track.position[2])
     vehicle_shape.vote_front(track)
     track.profile_vote += vehicle_shape.profile_vote(seen, row)
-    track.score_sum += score
+    track.score_sum += score * agreement
     track.label_scores[int(seen.label[row])] += score
     track.hits += 1
     track.misses = track.hidden = 0
@@ -423,7 +429,7 @@ def describe_all(
 def describe(
     track: Track, seen: Any, row: int | None, tracker: Tracker, config: TrackConfig
 ) -> TrackedVehicle:
-    """What is said of a track: with the box of its detection where there is one.
+    """What is said of a track: with a box between its own and that of its detection, where there is one.
 
     Args:
       track: after the sweep.
@@ -436,12 +442,15 @@ def describe(
       The vehicle.
     """
     own = vehicle_shape.Box(track.position.copy(), track.size(), vehicle_shape.wrap_yaw(track.yaw))
-    mean_score = track.score_sum / track.hits
+    score = track.score_sum / (track.hits + DOUBTED_HITS)
     if row is None:
-        shown, score = own, mean_score * math.exp(-track.covariance[0, 0] / float(config.unseen_sd_m) ** 2)
+        shown, score = own, score * math.exp(-track.covariance[0, 0] / float(config.unseen_sd_m) ** 2)
     else:
-        shown = vehicle_shape.refine_box(track, seen, row)
-        score = math.sqrt(mean_score * float(seen.score[row]))
+        of_sweep = vehicle_shape.refine_box(track, seen, row)
+        share = vehicle_shape.track_share(track, score, float(seen.score[row]))
+        center = (1 - share) * of_sweep.center + share * own.center
+        size = (1 - share) * of_sweep.size + share * own.size
+        shown = vehicle_shape.Box(center, size, of_sweep.yaw)
     heading, front_probability = vehicle_shape.front_of(shown.yaw, track)
     motion, shift = vehicle_motion.classify(track, tracker, config)
     missed = "HIDDEN" if track.hidden_now else "COASTING"

@@ -17,6 +17,8 @@ SEEN_QUANTILE, SEEN_STEP_M, SEEN_MIN_STEP_M = 0.9, 0.5, 0.05
 """Quantile of the seen extents, and the first and the least step of the search for it, m."""
 SEEN_SHARE = 0.8
 """A side of which a sweep saw more than this share of the track's is as long as that sweep says."""
+TRACK_WEIGHT = 0.5
+"""What the box of a track counts next to that of its detection, where both score alike."""
 MAX_COURSE_SD = 0.15
 """The course is believed where the velocity's standard deviation is below this share of the speed."""
 FULL_FRONT_SPEED_MPS = 3.0
@@ -299,3 +301,18 @@ def refine_box(track: Track, seen: Any, row: int) -> Box:
     new = np.array([flat[0] if seen_whole else length, width if crossed else flat[1]])
     place = keep_visible_faces(center[:2], flat, track.yaw, new)
     return Box(np.array([*place, center[2]]), np.array([*new, size[2]]), wrap_yaw(track.yaw))
+
+
+def track_share(track: Track, track_score: float, own_score: float) -> float:
+    """How far from the box of its detection to its own a track is shown; not at all after few detections.
+
+    Args:
+      track: updated.
+      track_score: in [0, 1].
+      own_score: in [0, 1], of the detection of this sweep.
+
+    Returns:
+      In [0, 1].
+    """
+    weight = TRACK_WEIGHT * track_score
+    return weight / (weight + own_score) if track.hits > MATURE_HITS and weight else 0.0

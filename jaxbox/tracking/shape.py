@@ -31,6 +31,8 @@ MAX_GROWTH = 1.25
 """What was seen makes a box longer than the mean by this factor at most."""
 SEEN_SHARE = 0.8
 """A side of which a sweep saw more than this share of the track's is as long as that sweep says."""
+TRACK_WEIGHT = 0.5
+"""What the box of a track counts next to that of its detection, where both score alike."""
 MAX_COURSE_SD = 0.15
 """The course is believed where the velocity's standard deviation is below this share of the speed."""
 FULL_FRONT_SPEED_MPS = 3.0
@@ -214,6 +216,24 @@ def refine_boxes(slots: Slots, seen: Observations) -> tuple[jax.Array, jax.Array
         jnp.where(known[:, None], jnp.concatenate([new, seen.size[:, 2:]], axis=1), seen.size),
         wrap_yaw(jnp.where(known, slots.yaw, seen.yaw)),
     )
+
+
+def track_share(slots: Slots, track_score: jax.Array, own_score: jax.Array) -> jax.Array:
+    """How far from the box of its detection to its own a track is shown: the farther the less that scores.
+
+    What one sweep got wrong of a box most others got right, and where the track is expected lags behind.
+
+    Args:
+      slots: T tracks.
+      track_score: (T,) float32, in [0, 1].
+      own_score: (T,) float32, in [0, 1], of the detections of this sweep.
+
+    Returns:
+      (T,) float32, in [0, 1]; 0 for tracks of few detections.
+    """
+    weight = TRACK_WEIGHT * track_score
+    share = weight / jnp.maximum(weight + own_score, 1e-6)
+    return jnp.where(slots.hits > MATURE_HITS, share, 0.0)
 
 
 def is_crossed(seen_yaw: jax.Array, yaw: jax.Array) -> jax.Array:

@@ -1,10 +1,10 @@
 """The second pass over a whole recording: what is seen later tells about what was seen before.
 
 Positions are smoothed forward and backward, a track has one size and, where it stands, one yaw, and it goes
-on through short gaps. What moves has the box of its track. Of what stands, as in the step, visible faces stay
-where each sweep saw them: length and width of the track are for the sides that it did not see. Height and
-vertical place are the track's in every sweep, because single ones depend on which beams hit the roof. All is
-float64 in NumPy, in the world of the poses.
+on through short gaps. What moves has the box of its track. What stands has, as in the step, one between that
+and the sweep's own, of which the track's length and width are for the sides that the sweep did not see.
+Height and vertical place are the track's in every sweep, because single ones depend on which beams hit the
+roof. All is float64 in NumPy, in the world of the poses.
 
 Axis letters: I tracks, L moments, F sweeps.
 """
@@ -27,6 +27,7 @@ from jaxbox.tracking.shape import (
     PROFILE_CORRELATION,
     SEEN_QUANTILE,
     SEEN_SHARE,
+    TRACK_WEIGHT,
 )
 from jaxbox.tracking.state import Observations
 from jaxbox.tracking.tracks import Tracks
@@ -268,11 +269,12 @@ def _smooth_group(
     z = _smooth_height(paths)[..., None]
     whole = np.broadcast_to(size[:, None], (*yaw.shape, 3))
     shown = np.concatenate([shown, whole[..., 2:]], axis=-1)
+    weight = TRACK_WEIGHT * mean_score[:, None]
     # Poses drift by more than the place of what stands is known; what moves is seen from changing sides.
-    is_own = (paths.hit & ~moving)[..., None]
+    share = np.where(paths.hit & ~moving, weight / np.maximum(weight + paths.score, 1e-6), 1.0)[..., None]
     columns = {
-        "center": np.concatenate([np.where(is_own, own, position), z], axis=-1),
-        "size": np.where(is_own, shown, whole),
+        "center": np.concatenate([own + share * (position - own), z], axis=-1),
+        "size": shown + share * (whole - shown),
         "yaw": yaw,
         "heading": heading,
         "front_probability": np.broadcast_to(front_probability[:, None], yaw.shape),

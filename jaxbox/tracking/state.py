@@ -79,7 +79,7 @@ class Slots:
     extent: jax.Array
     """(T, 2) float32, m: quantile of the extents seen, along and across."""
     score_sum: jax.Array
-    """(T,) float32."""
+    """(T,) float32: sum of the scores of its detections, each by how well it lay where it was expected."""
     label_score: jax.Array
     """(T, L) float32: sum of the scores of its detections by class."""
     hits: jax.Array

@@ -25,6 +25,10 @@ MAX_NUMBER = 1e6
 """A detection with a number beyond is no vehicle near a sensor; products of four such are finite still."""
 Z_GAIN, FIRST_Z_GAIN = 0.3, 0.5
 """Share of the difference that corrects the height of the centre, and that of the first detections."""
+EXPECTED_WITHIN_M = 1.2
+"""A detection so far from where its track was expected supports it by exp(-1) of its score."""
+DOUBTED_HITS = 0.5
+"""So many detections of score 0 are counted with those of each track: what is seen once may be chance."""
 
 
 def track_step(
@@ -199,13 +203,24 @@ def _learn(slots: Slots, own: Observations, dt: jax.Array, config: TrackConfig) 
         z=slots.z + z_gain * (own.center[:, 2] - slots.z),
         front_vote=shape.update_front(moved),
         profile_vote=slots.profile_vote + shape.profile_votes(own),
-        score_sum=slots.score_sum + own.score,
+        score_sum=slots.score_sum + _agreement(slots, center) * own.score,
         label_score=slots.label_score + _label_score(own),
         hits=slots.hits + 1,
         misses=jnp.zeros_like(slots.misses),
         hidden=jnp.zeros_like(slots.hidden),
         hidden_now=jnp.zeros_like(slots.hidden_now),
     )
+
+
+def _agreement(slots: Slots, center: jax.Array) -> jax.Array:
+    """(T,) float32, in (0, 1]: how well detections at (T, 2) m lie where their tracks were expected.
+
+    The box of a vehicle that is there moves as its track says; clutter and other vehicles jump. A track whose
+    velocity is not known yet expects nothing.
+    """
+    gap = center - slots.position
+    distance_sq = gap[:, 0] ** 2 + gap[:, 1] ** 2
+    return jnp.where(slots.hits < shape.MATURE_HITS, 1.0, jnp.exp(-distance_sq / EXPECTED_WITHIN_M**2))
 
 
 def _label_score(seen: Observations) -> jax.Array:
@@ -351,7 +366,7 @@ def _answer(
     interval: Interval,
     config: TrackConfig,
 ) -> Tracks:
-    """The tracks of the sweep: with the box of the detection where there is one, else with the track's."""
+    """The tracks of the sweep: with a box between its detection and the track's own, else with that."""
     slots, alive = state.slots, state.slots.alive
     is_seen = alive & (row < len(order))
     own = _take(seen, jnp.minimum(row, len(order) - 1))
@@ -359,7 +374,8 @@ def _answer(
     size, yaw = shape.track_size(slots), wrap_yaw(slots.yaw)
     own_center, own_size, own_yaw = shape.refine_boxes(slots, own)
     shown_yaw = jnp.where(is_seen, own_yaw, yaw)
-    mean_score = slots.score_sum / jnp.maximum(slots.hits.astype(jnp.float32), 1)
+    mean_score = slots.score_sum / (slots.hits.astype(jnp.float32) + DOUBTED_HITS)
+    share = shape.track_share(slots, mean_score, own.score)[:, None]
     # The variance over a square would be 0 / 0 in free slots, where the setting is the smallest allowed.
     sd_m = jnp.sqrt(slots.covariance[:, 0])
     expected_score = mean_score * jnp.exp(-((sd_m / config.unseen_sd_m) ** 2))
@@ -383,9 +399,9 @@ def _answer(
         lateral_shift_m=shift,
         label=jnp.argmax(slots.label_score, axis=1).astype(jnp.int32),
         label_probability=slots.label_score / jnp.maximum(label_sum, 1e-6),
-        score=jnp.where(is_seen, jnp.sqrt(own.score * mean_score), expected_score),
-        center=jnp.where(is_seen[:, None], own_center, center),
-        size=jnp.where(is_seen[:, None], own_size, size),
+        score=jnp.where(is_seen, mean_score, expected_score),
+        center=jnp.where(is_seen[:, None], own_center + share * (center - own_center), center),
+        size=jnp.where(is_seen[:, None], own_size + share * (size - own_size), size),
         yaw=shown_yaw,
         heading=heading,
         front_probability=front_probability,

@@ -176,18 +176,20 @@ class Tracks(BoxRows[Track]):
     label_probability: jax.Array
     """(T, L) float32, in [0, 1]: shares of the classes in the scores of its detections."""
     score: jax.Array
-    """(T,) float32, in [0, 1]: mean score of its detections; where it has one in this sweep, the geometric
-    mean of that and the detection's own, which tells how good this box is; where it has none, less the less
-    its place is known (`TrackConfig.unseen_sd_m`)."""
+    """(T,) float32, in [0, 1]: sum of the scores of its n detections over n + .5: what is seen once has two
+    thirds of it. A detection that lies a distance d from where the track was expected, after three, counts
+    exp(-(d / 1.2 m)^2) of its score. Where this sweep has none, less the less its place is known
+    (`TrackConfig.unseen_sd_m`)."""
     center: jax.Array
-    """(T, 3) float32, m, sensor frame of this sweep: of the detection's box where there is one, else where
-    the track is expected. After the second pass: of the track, where it moves."""
+    """(T, 3) float32, m, sensor frame of this sweep: where the track has a detection, of the detection's box;
+    from the fourth on, of one between that and the track's own, nearer to the track the less the detection
+    scores. Else where the track is expected. After the second pass: of the track, where it moves."""
     size: jax.Array
-    """(T, 3) float32, m: length, width, height, likewise; of a track of some detections, the length that
-    they agree on, with the faces that this sweep saw where it saw them."""
+    """(T, 3) float32, m: length, width, height, likewise; the box of a detection has the length that the
+    track's detections agree on, with the faces that this sweep saw where it saw them."""
     yaw: jax.Array
-    """(T,) float32, rad, in [-pi/2, pi/2): length axis from +x about +z, likewise; of a track of some
-    detections, the one that they agree on."""
+    """(T,) float32, rad, in [-pi/2, pi/2): length axis from +x about +z; of a track of some detections, the
+    one that they agree on."""
     heading: jax.Array
     """(T,) float32, rad, in [-pi, pi): where the front points; ``yaw`` or half a turn further."""
     front_probability: jax.Array
