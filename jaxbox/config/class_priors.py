@@ -226,7 +226,7 @@ class Label(enum.IntEnum):
         width_m=2.63,
         height_m=3.34,
         length_below_m=5.0,
-        length_above_m=4.0,
+        length_above_m=8.0,
         width_tolerance_m=0.4,
         height_below_m=0.8,
         height_above_m=0.8,
