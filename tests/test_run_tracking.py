@@ -68,7 +68,7 @@ def test_a_standing_street_stands_where_the_poses_are_known(drive):
     assert len(ids) >= 3
     assert np.abs(velocity).max() < 1.0
     # Scores grow with the number of detections, ids stay.
-    assert ids <= shown(tracked[2], 0.0)[0] | shown(tracked[4], 0.0)[0]
+    assert ids <= shown(tracked[2], UNSURE_SCORE / 2)[0] & shown(tracked[4], UNSURE_SCORE / 2)[0]
     # The row of each detection is one of the sweep's own.
     seen = tracked[-1].tracks
     rows = seen.detection[seen.detection >= 0]

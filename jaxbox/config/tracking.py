@@ -10,7 +10,7 @@ class TrackConfig:
 
     birth_score: Scalar = 0.02
     """A detection that belongs to no track begins one from this score on. It is low, because a track's score
-    is the mean of its detections, and a vehicle that is seen in one sweep only should not be lost."""
+    is about the mean of its detections', and a vehicle that is seen in one sweep only should not be lost."""
     high_score: Scalar = 0.1
     """Detections from this score on are matched first (ByteTrack: two stages),"""
     low_score: Scalar = 0.01

@@ -45,7 +45,7 @@ COURSE_SHARE = 0.5
 """At speeds at which the course has a vote for the yaw, it is this share of all the others."""
 MOVING_DISTANCE_M = 1.5
 """A track moves where its path is longer than this, m, and its median speed is that of a moving one."""
-TRACK_SHARE = 0.75
+MEAN_SCORE_SHARE = 0.75
 """Share of the track's mean score in the logarithm of a detection's; the rest is its own."""
 BELIEVED_HITS = 4.0
 """A track of n detections is believed n / (n + this), and one of all sweeps wholly: false alarms last shorter
@@ -265,7 +265,7 @@ def _smooth_group(
     hits = paths.hit.sum(axis=1)
     mean_score = paths.score.sum(axis=1) / hits
     belief = hits / (hits + BELIEVED_HITS) * (1 + BELIEVED_HITS / len(tracks))
-    own_score = mean_score[:, None] ** TRACK_SHARE * paths.score ** (1 - TRACK_SHARE)
+    own_score = mean_score[:, None] ** MEAN_SCORE_SHARE * paths.score ** (1 - MEAN_SCORE_SHARE)
     z = _smooth_height(paths)[..., None]
     whole = np.broadcast_to(size[:, None], (*yaw.shape, 3))
     shown = np.concatenate([shown, whole[..., 2:]], axis=-1)

@@ -218,8 +218,7 @@ def _agreement(slots: Slots, center: jax.Array) -> jax.Array:
     The box of a vehicle that is there moves as its track says; clutter and other vehicles jump. A track whose
     velocity is not known yet expects nothing.
     """
-    gap = center - slots.position
-    distance_sq = gap[:, 0] ** 2 + gap[:, 1] ** 2
+    distance_sq = kalman.squared_distance(slots.position, center)
     return jnp.where(slots.hits < shape.MATURE_HITS, 1.0, jnp.exp(-distance_sq / EXPECTED_WITHIN_M**2))
 
 
