@@ -78,6 +78,7 @@ ABLATIONS = (
     Ablation("no scene direction", {"box.direction_weight": 0.0}),
     Ablation("no third rectangle at a second peak", {"box.second_peak_loss": 0.0}),
     Ablation("no fourth rectangle along the principal axis", {"box.min_axis_points": 1e9}),
+    Ablation("edges at strays", {"box.min_stray_points": 1e9}),
     Ablation("few points of a slab are fitted to", {"box.min_slab_share": 0.0}),
     Ablation("64 points a rectangle", {"box.max_points": 64}),
     Ablation("256 points a rectangle", {"box.max_points": 256}),

@@ -191,8 +191,9 @@ def complete_boxes(segments: Segments, config: DetectorConfig) -> Completed:
     if config.box.scene_direction and cast is not None:
         unbiased = rectangles.choose_rectangles(rotations, clusters.num, preference)
         preference = direction.scene_preference(unbiased, clusters, cast, config)
-    candidates = rectangles.rectangle_candidates(rotations, clusters.num, preference, config)
-    return completion.complete_boxes(candidates, segments.outlines.points, clusters, cast, config)
+    points = segments.outlines.points
+    candidates = rectangles.rectangle_candidates(rotations, points, clusters.num, preference, config)
+    return completion.complete_boxes(candidates, points, clusters, cast, config)
 
 
 def score_boxes(completed: Completed, segments: Segments, config: DetectorConfig) -> Candidates:

@@ -323,6 +323,91 @@ def test_the_second_peak_of_a_curve_is_far_from_the_best_and_nearly_as_good(plat
     np.testing.assert_array_equal(np.stack(same, axis=1), curve)
 
 
+trim_strays = parity.PerForm(rectangles.trim_strays)
+STRAYS = dataclasses.replace(SETTINGS, stray_m=0.03, min_stray_points=1)
+
+
+def trimmed(rows, xy):
+    """One rectangle (6,) without strays, of points (n, 2)."""
+    table = *np.float32(xy.T)[..., None], np.array([len(xy)], np.int32)
+    rows = np.asarray(trim_strays(np.float32(rows)[:, None, None], table, np.float32(STRAYS.stray_m)))
+    return rows[:, 0, 0]
+
+
+def row_of(rectangle):
+    """A rectangle of the reference as a row."""
+    u0, u1, v0, v1 = rectangle.extents
+    return np.array([u0, v0, u1, v1, rectangle.angle, rectangle.score])
+
+
+@pytest.mark.usefixtures("platform")
+def test_edges_without_strays_are_those_of_the_reference(cases):
+    points, count, (lists, all_clusters, num) = fits_of(cases)
+    rng = np.random.default_rng(0)
+    outlines = [xy[:n].astype(float) for xy, n in zip(points, count, strict=True)]
+    rotations = reference.fit_rectangles(outlines, SETTINGS)
+    no_preference = np.zeros(SETTINGS.num_angles)
+    # Two rectangles of each cluster, as the candidates are several.
+    turns = rng.integers(0, SETTINGS.num_angles, (2, len(outlines)))
+    before = [reference.rectangles_at(index, rotations, no_preference) for index in turns]
+    rows = np.zeros((6, 2, MAX_FITS), np.float32)
+    rows[..., :num] = np.array([[row_of(each) for each in of_turn] for of_turn in before]).transpose(2, 0, 1)
+    ours = trim_strays(rows, lists.table(all_clusters), np.float32(STRAYS.stray_m))[..., :num]
+    after = [
+        [reference.trim_strays(each, xy, STRAYS) for each, xy in zip(of_turn, outlines, strict=True)]
+        for of_turn in before
+    ]
+    expected = np.array([[row_of(each) for each in of_turn] for of_turn in after]).transpose(2, 0, 1)
+    assert (np.abs(expected - rows[..., :num]).max(axis=0) > 0.01).sum() > 100
+    # Points .1 mm from the edge may be on it or not.
+    off = np.abs(np.asarray(ours) - expected).max(axis=0)
+    assert np.mean(off > 1e-4) < 5e-3
+
+
+@pytest.mark.usefixtures("platform")
+@pytest.mark.parametrize("yaw_deg", [0, 20, 77])
+@pytest.mark.parametrize("place", [(12, 3), (-12, 3), (-3, -12), (9, 0)])
+def test_only_a_single_point_ahead_of_a_side_that_faces_the_sensor_is_a_stray(yaw_deg, place):
+    yaw = np.radians(yaw_deg)
+    axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    sides = np.linspace(-1, 1, 41)
+    square = np.concatenate([np.stack([sides, np.full(41, end)], axis=1) for end in (-1, 1)])
+    square = np.concatenate([square, square[:, ::-1]])
+
+    def fitted(uv):
+        """The rectangle along the axes round the points, as it is and without strays, (2, 2) m each."""
+        xy = uv @ axes + place
+        along = xy @ axes.T
+        rows = np.concatenate([along.min(axis=0), along.max(axis=0), [yaw, 0]])
+        ours = trimmed(rows, xy)
+        rectangle = reference.Rectangle(rows[[0, 2, 1, 3]], yaw, 0.0)
+        np.testing.assert_allclose(ours, row_of(reference.trim_strays(rectangle, xy, STRAYS)), atol=1e-5)
+        return rows[:4].reshape(2, 2), ours[:4].reshape(2, 2)
+
+    before, after = fitted(square)
+    np.testing.assert_allclose(after, before, atol=1e-5)
+    for axis in (0, 1):
+        for is_high in (0, 1):
+            stray = np.zeros((1, 2))
+            stray[0, axis] = 1.4 if is_high else -1.4
+            with_stray, without = fitted(np.concatenate([square, stray]))
+            is_nearer = np.abs(with_stray[is_high, axis]) < np.abs(with_stray[1 - is_high, axis])
+            ahead = np.abs(without - before)
+            assert ahead[is_high, axis] == pytest.approx(0.03 if is_nearer else 0.4, abs=1e-4)
+            assert np.delete(ahead, 2 * is_high + axis).max() < 1e-4
+            # Two of them side by side are no stray.
+            _, of_two = fitted(np.concatenate([square, stray, stray + 0.1 * (stray[:, ::-1] != 0)]))
+            np.testing.assert_allclose(of_two, with_stray, atol=1e-5)
+
+
+@pytest.mark.usefixtures("platform")
+def test_an_edge_that_all_points_lie_on_stays():
+    one, line = np.array([[5.0, 1.0]]), np.array([[5.0, 1.0], [5.0, 2.0]])
+    for xy, low_v in ((one, 1), (np.repeat(one, 3, axis=0), 1), (line, 1.97)):
+        rows = np.array([5, xy[:, 1].min(), 5, xy[:, 1].max(), 0, 0.5])
+        np.testing.assert_allclose(trimmed(rows, xy), [5, low_v, *rows[2:]], atol=1e-6)
+
+
 @pytest.mark.usefixtures("platform")
 @pytest.mark.parametrize("criterion", CRITERIA)
 def test_curves_extents_and_best_rectangles_are_those_of_the_reference(cases, criterion):

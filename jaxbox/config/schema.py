@@ -249,6 +249,11 @@ class BoxConfig:
     visible points of a hidden side say little of its direction."""
     min_distance_m: Scalar = 0.05
     """Closeness: points nearer to an edge than this count as on it."""
+    stray_m: Scalar = 0.03
+    """The two edges nearer to the sensor lie at most so far ahead of all points but one: a mirror is not the
+    vehicle's side. Not where the rectangle is fitted to a hull."""
+    min_stray_points: Scalar = 40.0
+    """Rectangles that are fitted to fewer points keep the outermost one at every edge."""
     scene_direction: bool = _static(default=True)
     """static: prefer the direction that most boxes of the sweep share; needs the evidence."""
     direction_weight: Scalar = 0.1

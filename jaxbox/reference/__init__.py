@@ -117,6 +117,7 @@ from jaxbox.reference.rectangles import (
     rectangle_candidates,
     rectangles_at,
     second_peak,
+    trim_strays,
     try_rotations,
     wrap_yaw,
 )
@@ -312,6 +313,7 @@ __all__ = [
     "surface_height",
     "top_of",
     "track_step",
+    "trim_strays",
     "try_rotations",
     "turn_back",
     "turn_sweep",

@@ -84,7 +84,7 @@ def _read(xyz: np.ndarray, config: DetectorConfig, seed: int) -> assembly.Refere
         first = maps[0].clusters
         unbiased = fitting.best_rectangles(rotations[: len(first)], preference)
         preference = direction.scene_preference(unbiased, first, seen, config)
-    rectangles = fitting.rectangle_candidates(rotations, preference, config)
+    rectangles = fitting.rectangle_candidates(rotations, outlines, preference, config)
     completed = completion.complete_boxes(rectangles, outlines, clusters, seen, config)
     # Vehicle decision, and non-maximum suppression.
     rays = None

@@ -72,20 +72,37 @@ def rectangles_at(
 
 
 def rectangle_candidates(
-    rotations: Sequence[Rotations], preference: np.ndarray, config: DetectorConfig
+    rotations: Sequence[Rotations],
+    outlines: Sequence[np.ndarray],
+    preference: np.ndarray,
+    config: DetectorConfig,
 ) -> list[list[Rectangle]]:
     """The rectangles of each cluster that the evidence is to choose from.
 
     Args:
       rotations: of the clusters.
+      outlines: (n, 2) m, the points of each that those were fitted to.
       preference: (A,), for the scene's direction.
       config: of the detector.
 
     Returns:
       Those at the best rotation, bent to the scene's direction; where the preset asks, those that know
       nothing of it, those that keep to it, those at a second peak of the curve, and those along the
-      principal axis of the points: a list each.
+      principal axis of the points: a list each. Those fitted to the points themselves are without strays.
     """
+    candidates = _with_strays(rotations, preference, config)
+    if config.box.fit_to == "hull":
+        return candidates
+    return [
+        [trim_strays(each, xy, config.box) for each, xy in zip(rectangles, outlines, strict=True)]
+        for rectangles in candidates
+    ]
+
+
+def _with_strays(
+    rotations: Sequence[Rotations], preference: np.ndarray, config: DetectorConfig
+) -> list[list[Rectangle]]:
+    """Those candidates, with each edge at its outermost point."""
     along_scene = config.box.scene_direction and config.completion.along_scene
     if not along_scene:
         return [best_rectangles(rotations, preference)]
@@ -101,6 +118,33 @@ def rectangle_candidates(
         best_rectangles(second, preference, gain=0),
         rectangles_at([along_axis(each, config.box) for each in rotations], rotations, preference),
     ]
+
+
+def trim_strays(rectangle: Rectangle, xy: np.ndarray, config: BoxConfig) -> Rectangle:
+    """Moves an edge that a single point carries ahead of the others up to those.
+
+    Args:
+      rectangle: of a cluster.
+      xy: (n, 2) m, its points.
+      config: of `min_stray_points` or more the one on one of the two edges nearer to the sensor lies at most
+        `stray_m` ahead of all others.
+
+    Returns:
+      The rectangle; as it is of fewer points.
+    """
+    if len(xy) < config.min_stray_points:
+        return rectangle
+    extents = rectangle.extents.copy()
+    cos, sin = np.cos(rectangle.angle), np.sin(rectangle.angle)
+    u, v = xy @ [cos, sin], xy @ [-sin, cos]
+    for axis, (along, across) in enumerate([(u, v), (v, u)]):
+        low, high = extents[2 * axis : 2 * axis + 2]
+        edge, sign = (2 * axis, -1) if abs(low) < abs(high) else (2 * axis + 1, 1)
+        ahead = sign * along
+        inside = ahead < ahead.max() - SAME_DISTANCE_M
+        if inside.any() and np.ptp(across[~inside]) < SAME_DISTANCE_M:
+            extents[edge] = sign * min(ahead.max(), ahead[inside].max() + float(config.stray_m))
+    return dataclasses.replace(rectangle, extents=extents)
 
 
 def principal_rotations(outlines: Sequence[np.ndarray], num_angles: int) -> list[int]:

@@ -1,7 +1,7 @@
 """Rectangles by trying all rotations (paper, section 3.4, Algorithm III)."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import chex
 import jax
@@ -50,7 +50,7 @@ def fit_rectangles(outlines: Outlines, num_clusters: jax.Array, config: BoxConfi
     chex.assert_equal_shape([points.start, points.total])
     order, place = largest_first(points.count, points.max_points)
     curve, extents, principal = try_rotations(points, order, num_clusters, config)
-    return Rotations(curve, extents, take(points.count, order), place, principal)
+    return Rotations(curve, extents, take(points.count, order), order, place, principal)
 
 
 def choose_rectangles(
@@ -67,6 +67,14 @@ def choose_rectangles(
     Returns:
       (P,) rectangles.
     """
+    columns = _best_columns(rotations, num_clusters, preference, gain=gain)
+    return Rectangles(columns.T[rotations.place])
+
+
+def _best_columns(
+    rotations: Rotations, num_clusters: jax.Array, preference: jax.Array, *, gain: float = 1.0
+) -> jax.Array:
+    """(6, P) rows of `Rectangles`, of the clusters with most points first."""
 
     def best(rotations: tuple[jax.Array, jax.Array]) -> jax.Array:
         return best_rectangles(*rotations, preference, gain=gain).rows.T
@@ -74,17 +82,21 @@ def choose_rectangles(
     num_angles, num_columns = rotations.curve.shape
     chex.assert_shape([preference, rotations.extents], [(num_angles,), (4, num_angles, num_columns)])
     columns = rotations.curve, rotations.extents
-    rows = map_rows(best, columns, num_rows=num_clusters, chunk=chunks.PROPOSALS, axis=-1)
-    return Rectangles(rows.T[rotations.place])
+    return map_rows(best, columns, num_rows=num_clusters, chunk=chunks.PROPOSALS, axis=-1)
 
 
 def rectangle_candidates(
-    rotations: Rotations, num_clusters: jax.Array, preference: jax.Array, config: DetectorConfig
+    rotations: Rotations,
+    points: PointLists,
+    num_clusters: jax.Array,
+    preference: jax.Array,
+    config: DetectorConfig,
 ) -> list[Rectangles]:
     """The rectangles of each cluster that the evidence is to choose from.
 
     Args:
       rotations: of P clusters.
+      points: that those were fitted to.
       num_clusters: () int32, how many count.
       preference: (A,) float32, for the scene's direction.
       config: of the detector.
@@ -92,10 +104,20 @@ def rectangle_candidates(
     Returns:
       That at the best rotation, bent to the scene's direction; where the preset asks, four: one that knows
       nothing of that direction, one that keeps to it, one at a second peak of the curve, and one along the
-      principal axis of the points.
+      principal axis of the points. Those fitted to the points themselves are without strays.
     """
+    columns = _candidate_columns(rotations, num_clusters, preference, config)
+    if config.box.fit_to == "slab":
+        columns = _without_strays(columns, rotations, points, num_clusters, config.box)
+    return [Rectangles(each.T[rotations.place]) for each in columns]
+
+
+def _candidate_columns(
+    rotations: Rotations, num_clusters: jax.Array, preference: jax.Array, config: DetectorConfig
+) -> list[jax.Array]:
+    """(6, P) each: the rows of the candidates, of the clusters with most points first."""
     if not (config.box.scene_direction and config.completion.along_scene):
-        return [choose_rectangles(rotations, num_clusters, preference)]
+        return [_best_columns(rotations, num_clusters, preference)]
 
     def try_others(columns: tuple[jax.Array, ...]) -> list[jax.Array]:
         curve, extents, num_points, principal = columns
@@ -108,10 +130,76 @@ def rectangle_candidates(
     columns = rotations.curve, rotations.extents, rotations.num_points[None], rotations.principal[None]
     others = map_rows(try_others, columns, num_rows=num_clusters, chunk=chunks.PROPOSALS, axis=-1)
     return [
-        choose_rectangles(rotations, num_clusters, preference, gain=0),
-        choose_rectangles(rotations, num_clusters, preference, gain=PREFERENCE_GAIN),
-        *(Rectangles(rows.T[rotations.place]) for rows in others),
+        _best_columns(rotations, num_clusters, preference, gain=0),
+        _best_columns(rotations, num_clusters, preference, gain=PREFERENCE_GAIN),
+        *others,
     ]
+
+
+def _without_strays(
+    candidates: Sequence[jax.Array],
+    rotations: Rotations,
+    points: PointLists,
+    num_clusters: jax.Array,
+    config: BoxConfig,
+) -> list[jax.Array]:
+    """(6, P) each: the candidates of clusters with many points, which come first, by `trim_strays`."""
+    many = rotations.num_points.astype(jnp.float32) >= config.min_stray_points
+
+    def trim(columns: tuple[jax.Array, jax.Array]) -> jax.Array:
+        rows, cluster = columns
+        return trim_strays(rows, points.table(cluster), config.stray_m)
+
+    rows = jnp.stack(candidates, axis=1)
+    num_many = jnp.minimum(num_clusters, jnp.sum(many, dtype=jnp.int32))
+    columns = rows, rotations.cluster
+    trimmed = map_rows(trim, columns, num_rows=num_many, chunk=chunks.PROPOSALS, axis=-1)
+    trimmed = jnp.where(many[None, None], trimmed, rows)
+    return [trimmed[:, i] for i in range(len(candidates))]
+
+
+def trim_strays(rectangles: jax.Array, clusters: PointTable, stray_m: Scalar) -> jax.Array:
+    """Moves edges that a single point carries ahead of the others up to those.
+
+    A mirror, or a return from between two surfaces, lies ahead of a vehicle's side. Only the two edges nearer
+    to the sensor move: points thin out towards the others, and the last one says where the vehicle ends.
+
+    Args:
+      rectangles: (6, K, C) float32, rows of `Rectangles`, of each cluster K.
+      clusters: the points of C clusters.
+      stray_m: () m, how far ahead of all others the point on such an edge may lie.
+
+    Returns:
+      As `rectangles`; an edge that two points lie on, or all of them, stays.
+
+    Reference: oracle `jaxbox.reference.trim_strays`.
+    """
+    low, high, angle = rectangles[:2], rectangles[2:4], rectangles[4]
+    cos, sin = jnp.cos(angle), jnp.sin(angle)
+    # Along u and along v, (2, K, C), with coordinates that grow towards the sensor.
+    is_low = jnp.abs(low) < jnp.abs(high)
+    sign = jnp.where(is_low, -1.0, 1.0)
+    edge = sign * jnp.where(is_low, low, high)
+    to_x, to_y = sign * jnp.stack([cos, -sin]), sign * jnp.stack([sin, cos])
+    inside = edge - SAME_DISTANCE_M
+
+    def update(reach: tuple[jax.Array, ...], x: jax.Array, y: jax.Array) -> tuple[jax.Array, ...]:
+        along = x[None, None] * to_x + y[None, None] * to_y
+        across, is_inside = along[::-1], along < inside
+        here = (
+            jnp.where(is_inside, along, -jnp.inf),
+            jnp.where(is_inside, -jnp.inf, across),
+            jnp.where(is_inside, -jnp.inf, -across),
+        )
+        return tuple(fast_max(before, to) for before, to in zip(reach, here, strict=True))
+
+    x, y, count = clusters
+    nothing = (jnp.full_like(edge, -jnp.inf),) * 3
+    others, left, right = fold_points(x, y, count, nothing, update, absent=(x[0], y[0]), operation="max")
+    is_stray = (left + right < SAME_DISTANCE_M) & (others > -jnp.inf)
+    edge = jnp.where(is_stray, fast_min(edge, others + stray_m), edge)
+    low, high = jnp.where(is_low, -edge, low), jnp.where(is_low, high, edge)
+    return jnp.concatenate([low, high, rectangles[4:]])
 
 
 def along_axis(

@@ -176,6 +176,8 @@ class Rotations:
     """(4, A, P) float32, m: lower and upper bounds of u, then of v; likewise."""
     num_points: jax.Array
     """(P,) int32: how many points the rectangles were fitted to; likewise."""
+    cluster: jax.Array
+    """(P,) int32: which cluster they are of; likewise."""
     place: jax.Array
     """(P,) int32: where each cluster is in those."""
     principal: jax.Array
