@@ -53,31 +53,26 @@ def fit_rectangles(outlines: Outlines, num_clusters: jax.Array, config: BoxConfi
     return Rotations(curve, extents, take(points.count, order), order, place, principal)
 
 
-def choose_rectangles(
-    rotations: Rotations, num_clusters: jax.Array, preference: jax.Array, *, gain: float = 1.0
-) -> Rectangles:
+def choose_rectangles(rotations: Rotations, num_clusters: jax.Array, preference: jax.Array) -> Rectangles:
     """The rectangle of each cluster at its best rotation, see `best_rectangles`.
 
     Args:
       rotations: of P clusters.
       num_clusters: () int32, how many count.
       preference: (A,) float32, added to every curve.
-      gain: how often the preference counts when the rotation is chosen; the score counts it once.
 
     Returns:
       (P,) rectangles.
     """
-    columns = _best_columns(rotations, num_clusters, preference, gain=gain)
+    columns = _best_columns(rotations, num_clusters, preference)
     return Rectangles(columns.T[rotations.place])
 
 
-def _best_columns(
-    rotations: Rotations, num_clusters: jax.Array, preference: jax.Array, *, gain: float = 1.0
-) -> jax.Array:
+def _best_columns(rotations: Rotations, num_clusters: jax.Array, preference: jax.Array) -> jax.Array:
     """(6, P) rows of `Rectangles`, of the clusters with most points first."""
 
     def best(rotations: tuple[jax.Array, jax.Array]) -> jax.Array:
-        return best_rectangles(*rotations, preference, gain=gain).rows.T
+        return best_rectangles(*rotations, preference).rows.T
 
     num_angles, num_columns = rotations.curve.shape
     chex.assert_shape([preference, rotations.extents], [(num_angles,), (4, num_angles, num_columns)])
@@ -119,21 +114,21 @@ def _candidate_columns(
     if not (config.box.scene_direction and config.completion.along_scene):
         return [_best_columns(rotations, num_clusters, preference)]
 
-    def try_others(columns: tuple[jax.Array, ...]) -> list[jax.Array]:
+    def bound(columns: tuple[jax.Array, ...]) -> list[jax.Array]:
         curve, extents, num_points, principal = columns
-        peak = second_peak(curve, num_points[0], max_loss=config.box.second_peak_loss)
         best, _ = first_argmax(curve)
-        index = along_axis(best, principal[0], num_points[0], curve.shape[0], config.box.min_axis_points)
-        along = rectangles_at(index, curve, extents, preference)
-        return [best_rectangles(peak, extents, preference, gain=0).rows.T, along.rows.T]
+        peak = second_peak(curve, num_points[0], max_loss=config.box.second_peak_loss)
+        along = along_axis(best, principal[0], num_points[0], curve.shape[0], config.box.min_axis_points)
+        found = [
+            rectangles_at(best, curve, extents, preference),
+            best_rectangles(curve, extents, preference, gain=PREFERENCE_GAIN),
+            best_rectangles(peak, extents, preference, gain=0),
+            rectangles_at(along, curve, extents, preference),
+        ]
+        return [each.rows.T for each in found]
 
     columns = rotations.curve, rotations.extents, rotations.num_points[None], rotations.principal[None]
-    others = map_rows(try_others, columns, num_rows=num_clusters, chunk=chunks.PROPOSALS, axis=-1)
-    return [
-        _best_columns(rotations, num_clusters, preference, gain=0),
-        _best_columns(rotations, num_clusters, preference, gain=PREFERENCE_GAIN),
-        *others,
-    ]
+    return map_rows(bound, columns, num_rows=num_clusters, chunk=chunks.PROPOSALS, axis=-1)
 
 
 def _without_strays(
