@@ -173,7 +173,7 @@ def trim_strays(rectangles: jax.Array, clusters: PointTable, stray_m: Scalar) ->
     cos, sin = jnp.cos(angle), jnp.sin(angle)
     # Along u and along v, (2, K, C), with coordinates that grow towards the sensor.
     is_low = jnp.abs(low) < jnp.abs(high)
-    sign = jnp.where(is_low, -1.0, 1.0)
+    sign = 1 - 2 * is_low.astype(jnp.float32)
     edge = sign * jnp.where(is_low, low, high)
     to_x, to_y = sign * jnp.stack([cos, -sin]), sign * jnp.stack([sin, cos])
     inside = edge - SAME_DISTANCE_M
