@@ -5,6 +5,7 @@ import pathlib
 
 import numpy as np
 import pytest
+from kitti_objects import car
 
 from benchmarks import bench_classes as bench
 
@@ -37,7 +38,8 @@ def test_a_label_has_the_score_of_the_best_box_that_covers_half_of_it():
 )
 def test_the_cut_is_the_least_score_from_which_nine_of_ten_are_right(right, cut):
     scores = np.linspace(0.9, 0, 10)[: len(right)]
-    assert bench.cut_of(scores, np.array(right, bool)) == (None if cut is None else pytest.approx(cut))
+    found = bench.cut_of(scores, np.array(right, bool), 0.9)
+    assert found == (None if cut is None else pytest.approx(cut))
 
 
 def test_counts_are_by_class_and_points():
@@ -48,9 +50,24 @@ def test_counts_are_by_class_and_points():
     table = bench.summarise([frame, frame])
     truck, van = table["Truck"], table["Van"]
     assert (truck["labels 30"], truck["found 30"], truck["labels 100"], truck["found 100"]) == (4, 2, 2, 2)
-    assert (truck["boxes"], truck["right"], truck["false"], truck["cut"]) == (6, 2, 2, 0.4)
-    assert truck["found 100 from the cut"] == 0
-    assert (van["labels 30"], van["found 30"], van["labels 100"], van["cut"]) == (2, 2, 0, None)
+    assert (truck["boxes"], truck["right"], truck["false"], truck["cut 0.9"]) == (6, 2, 2, 0.4)
+    assert truck["found 100 from 0.9"] == 0
+    assert (van["labels 30"], van["found 30"], van["labels 100"], van["cut 0.9"]) == (2, 2, 0, None)
+    vehicles = table["Any"]
+    assert (vehicles["labels 30"], vehicles["found 30"], vehicles["labels 100"]) == (6, 4, 2)
+    assert (vehicles["boxes"], vehicles["right"], vehicles["cut 0.95"]) == (8, 4, 0.4)
+    assert vehicles["found 30 from 0.95"] == vehicles["found 100 from 0.95"] == 0
+
+
+def test_what_lies_for_more_than_half_in_a_region_is_in_it():
+    def seen(left, right, kind="Car"):
+        return car(type=kind, box_px=np.array([left, 100.0, right, 200.0]))
+
+    half, more, beside = seen(0, 200), seen(1, 200), seen(300, 400)
+    regions = [seen(100, 280, "DontCare"), seen(390, 500, "DontCare")]
+    assert bench.in_regions([half, more, beside], regions).tolist() == [False, True, False]
+    assert bench.in_regions([half, more], []).tolist() == [False, False]
+    assert bench.in_regions([], regions).shape == (0,)
 
 
 def test_the_record_is_of_all_frames_and_copies():
@@ -58,4 +75,10 @@ def test_the_record_is_of_all_frames_and_copies():
     assert (report["num_frames"], report["num_copies"]) == (78, 6)
     for row in report["classes"].values():
         assert row["false"] <= row["boxes"] - row["right"]
-        assert row["found 100 from the cut"] <= row["found 100"] <= row["labels 100"]
+        for least in (30, 100):
+            found = [row[f"found {least}{cut}"] for cut in (" from 0.95", " from 0.9", "")]
+            assert found == sorted(found)
+            assert found[-1] <= row[f"labels {least}"]
+    *classes, together = report["classes"].values()
+    for name in ("labels 30", "found 30", "boxes", "right", "false"):
+        assert together[name] == sum(row[name] for row in classes)

@@ -106,6 +106,9 @@ def classes() -> str:
     def share(part: int, whole: int) -> str:
         return f"{part} of {whole}"
 
+    def cut(score: float | None) -> float | str:
+        return "none" if score is None else score
+
     rows = [
         (
             kind,
@@ -113,8 +116,10 @@ def classes() -> str:
             share(row["found 100"], row["labels 100"]),
             share(row["right"], row["boxes"]),
             row["false"],
-            "none" if row["cut"] is None else row["cut"],
-            share(row["found 100 from the cut"], row["labels 100"]),
+            cut(row["cut 0.9"]),
+            share(row["found 100 from 0.9"], row["labels 100"]),
+            cut(row["cut 0.95"]),
+            share(row["found 30 from 0.95"], row["labels 30"]),
         )
         for kind, row in report["classes"].items()
     ]
@@ -124,8 +129,10 @@ def classes() -> str:
         "found, 100 points",
         "right",
         "false",
-        "9 of 10 right from",
-        "found then",
+        "90 % right from",
+        "found, 100 points",
+        "95 % right from",
+        "found, 30 points",
     ]
     return table(header, rows) + made_with(report)
 
