@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks import common
 from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig, Label
 from jaxbox.evaluation import pairwise_overlaps
-from jaxbox.evaluation.boxes import image_boxes
+from jaxbox.evaluation.boxes import excused_in_image
 from jaxbox.evaluation.copies import (
     COPIES,
     Copy,
@@ -30,7 +30,6 @@ from jaxbox.evaluation.copies import (
     turn_back,
     turn_points,
 )
-from jaxbox.evaluation.iou import image_fractions
 from jaxbox.io import KittiObject, boxes_from_objects, objects_from_detections, open_sweeps
 from jaxbox.types import Calibration
 
@@ -59,12 +58,6 @@ def best_scores(labels: np.ndarray, boxes: np.ndarray, scores: np.ndarray) -> np
     return np.max(np.where(overlap >= FOUND_OVERLAP, scores, 0), axis=1, initial=0)
 
 
-def in_regions(objects: Sequence[KittiObject], regions: Sequence[KittiObject]) -> np.ndarray:
-    """(n,) bool: whether objects lie for more than half in one of the regions of the image."""
-    covered = image_fractions(image_boxes(objects), image_boxes(regions))
-    return covered.max(axis=1, initial=0) > MAX_DONT_CARE
-
-
 def measure(frame: Frame, copy: Copy, num_points: np.ndarray, config: DetectorConfig) -> dict[str, Any]:
     """Of one frame: labels as (type, points, best score), and shown boxes as (type, score, overlap)."""
     found = turn_back(common.detect(turn_points(frame.xyz, copy), frame.intensity, config), copy)
@@ -80,8 +73,7 @@ def measure(frame: Frame, copy: Copy, num_points: np.ndarray, config: DetectorCo
     ]
     overlap = pairwise_overlaps(rows, rows_of(shown, frame.calibration))[0].max(axis=0, initial=0)
     best = best_scores(rows, boxes, scores)
-    unlabelled = in_regions(shown, [label for label in frame.labels if label.is_dont_care])
-    judged = (overlap >= RIGHT_OVERLAP) | ~unlabelled
+    judged = (overlap >= RIGHT_OVERLAP) | (excused_in_image(frame.labels, shown) <= MAX_DONT_CARE)
     return {
         "labels": [
             (label.type, int(points), float(score))

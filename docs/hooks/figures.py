@@ -130,9 +130,9 @@ def classes() -> str:
         "right",
         "false",
         "90 % right from",
-        "found, 100 points",
+        "found then, 100 points",
         "95 % right from",
-        "found, 30 points",
+        "found then, 30 points",
     ]
     return table(header, rows) + made_with(report)
 

@@ -1,11 +1,11 @@
-"""KITTI's objects as arrays: boxes in space and in the image, and what DontCare regions cover from above."""
+"""KITTI's objects as arrays: boxes in space and in the image, and what DontCare regions cover of them."""
 
 import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
-from jaxbox.evaluation.iou import framewise_overlaps
+from jaxbox.evaluation.iou import framewise_overlaps, image_fractions
 from jaxbox.io import KittiObject
 
 
@@ -36,6 +36,20 @@ def image_boxes(objects: Sequence[KittiObject]) -> np.ndarray:
       (n, 4) float64, px: left, top, right, bottom.
     """
     return np.array([item.box_px for item in objects], float).reshape(-1, 4)
+
+
+def excused_in_image(labels: Sequence[KittiObject], detections: Sequence[KittiObject]) -> np.ndarray:
+    """How far DontCare regions cover detections in the image.
+
+    Args:
+      labels: of a frame.
+      detections: n of the same frame.
+
+    Returns:
+      (n,) float64: the largest fraction of the 2D box within that of one region.
+    """
+    regions = image_boxes([label for label in labels if label.is_dont_care])
+    return image_fractions(image_boxes(detections), regions).max(axis=1, initial=0)
 
 
 def excused_from_above(

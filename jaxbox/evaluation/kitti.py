@@ -24,8 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxbox.evaluation.boxes import camera_boxes, excused_from_above, image_boxes
-from jaxbox.evaluation.iou import framewise_overlaps, image_fractions, image_iou
+from jaxbox.evaluation.boxes import camera_boxes, excused_from_above, excused_in_image, image_boxes
+from jaxbox.evaluation.iou import framewise_overlaps, image_iou
 from jaxbox.io import KittiObject
 from jaxbox.types import Label
 
@@ -325,8 +325,7 @@ def _build_frame(
     from_above: np.ndarray,
 ) -> PreparedFrame:
     image = image_iou(image_boxes(labels), image_boxes(detections))
-    regions = image_boxes([label for label in labels if label.is_dont_care])
-    in_image = image_fractions(image_boxes(detections), regions).max(axis=1, initial=0)
+    in_image = excused_in_image(labels, detections)
     scores = np.array([item.score for item in detections], float)
     overlaps = {"image": image, "orientation": image, "bev": bev, "3d": box}
     nowhere = np.zeros(len(detections))

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from jaxbox.evaluation import kitti
-from jaxbox.evaluation.boxes import camera_boxes, image_boxes
-from jaxbox.evaluation.iou import framewise_overlaps, image_fractions
+from jaxbox.evaluation.boxes import camera_boxes, excused_in_image, image_boxes
+from jaxbox.evaluation.iou import framewise_overlaps
 from jaxbox.io import KittiObject
 from jaxbox.types import Label
 
@@ -173,8 +173,7 @@ def _rows_of(results: Sequence[KittiObject], class_name: str, frame: str) -> np.
 
 def _excused(detections: Sequence[KittiObject], labels: Sequence[KittiObject]) -> np.ndarray:
     boxes = image_boxes(detections)
-    regions = image_boxes([item for item in labels if item.is_dont_care])
-    covered = image_fractions(boxes, regions).max(axis=1, initial=0)
+    covered = excused_in_image(labels, detections)
     return (boxes[:, 3] - boxes[:, 1] < _MIN_HEIGHT_PX) | (covered > _EXCUSED_FRACTION)
 
 
