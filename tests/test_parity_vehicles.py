@@ -234,6 +234,33 @@ def test_far_ends_are_where_the_reference_sees_them():
     assert 50 < moved.sum() < MAX_BOXES / 2
 
 
+def hilly(xyz):
+    """z of a made-up ground under points (n, 3), with slopes towards and away from the sensor."""
+    x, y, z = xyz.T
+    return 0.01 * x + abs(y % 20 - 10) / 20 + 0.1 * z - 1.7
+
+
+def test_far_vehicles_stand_where_the_reference_says():
+    rng = np.random.default_rng(0)
+    place = rng.uniform(-80, 80, (MAX_BOXES, 2)) * rng.choice([0.01, 0.3, 1], (MAX_BOXES, 1))
+    size, yaw = rng.uniform([2, 1], [9, 3], (MAX_BOXES, 2)), rng.uniform(-4, 4, MAX_BOXES)
+    boxes = np.column_stack([place, size, yaw]).astype(np.float32)
+    z = rng.uniform(-2, 1, MAX_BOXES).astype(np.float32)
+
+    stand = jax.jit(lambda *rows: scoring.stand_on_ground(*rows, hilly, SETTINGS))
+    ground, lower = stand(boxes, z)
+    rows = zip(boxes.astype(float), z.astype(float), strict=True)
+    expected = np.array([reference.stand_on_ground(*row, hilly, SETTINGS) for row in rows])
+    np.testing.assert_allclose(np.column_stack([ground, lower]), expected, atol=1e-4)
+    np.testing.assert_allclose(ground, hilly(np.column_stack([place, z])), atol=1e-4)
+    far = np.hypot(*boxes[:, :2].astype(float).T) - SETTINGS.far_ground_from_m
+    assert (expected[far < 0, 1] == 0).all()
+    assert (expected[far > 0, 1] >= SETTINGS.far_ground_rise * far[far > 0] - 1e-6).all()
+    assert (expected[:, 1] > SETTINGS.far_ground_rise * np.maximum(far, 0) + 0.01).sum() > 20
+    alone = dataclasses.replace(SETTINGS, neighbourhood=False)
+    assert not np.any(scoring.stand_on_ground(boxes, z, hilly, alone)[1])
+
+
 def test_overlap_of_boxes_is_that_of_opencv(cases):
     rng = np.random.default_rng(0)
     for case in cases:

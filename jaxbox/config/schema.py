@@ -368,6 +368,13 @@ class VehicleConfig:
     """Added to the top of the points: beams seldom meet the very top."""
     top_grade: Scalar = 0.0075
     """A top may be higher than that of its points by this times the range: the beams' spacing."""
+    far_ground_from_m: Scalar = 30.0
+    """From this range on vehicles stand lower than what is taken for the ground below their middle: on that
+    1 m before them where it is lower, in full 15 m farther. Below them none is seen. Not without
+    ``neighbourhood``."""
+    far_ground_rise: Scalar = 0.002
+    """m/m: and lower by this times the range beyond. A beam that grazes the ground returns from where its
+    lower edge meets it, nearer and so higher than its middle says."""
     min_extent_m: Scalar = 0.6
     """Boxes with no measured extent as long as this, and clusters with such a diagonal, are not vehicles."""
     min_lone_extent_m: Scalar = 1.0

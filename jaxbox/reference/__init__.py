@@ -9,6 +9,7 @@ from jaxbox.reference.assembly import (
     ReferenceDetections,
     assemble,
     assign_points,
+    stand_on_ground,
 )
 from jaxbox.reference.clustering import (
     compress_range,
@@ -309,6 +310,7 @@ __all__ = [
     "sides_in_rows",
     "size_score",
     "spread_points",
+    "stand_on_ground",
     "steepest_beam",
     "surface_height",
     "top_of",

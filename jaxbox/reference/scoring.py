@@ -264,6 +264,8 @@ def score_box(
     Returns:
       The score, without what a hidden length costs; 0 where a gate of the class closes.
     """
+    if box.longest_m < config.min_lone_extent_m and not in_threes:
+        return 0.0
     early = early_score(
         box,
         prior,

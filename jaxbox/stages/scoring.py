@@ -53,6 +53,10 @@ NEARLY_WIDE = 0.6, 0.8
 """Between these measured fractions of the class's width a bumper is believed to be one, and a rear whole."""
 
 
+BEFORE_M, FAR_RAMP_M = 1.0, 15.0
+"""Far vehicles stand on the ground so much before them, in full from so much beyond the least range on."""
+
+
 WIDE = 0.4
 """From this fraction of the class's width on a box has two faces, as walls seldom have."""
 
@@ -122,12 +126,13 @@ def score_boxes(
             seen = jnp.where(is_sliver, 1, seen)
             score = score * (seen + settings.hidden_length_score * (1 - seen))
         z = jnp.zeros_like(rectangle[:, 0]) if lowest_z is None else take(lowest_z, cluster)
-        ground = ground_elevation(jnp.concatenate([rectangle[:, :2], z[:, None]], axis=1))
+        ground, lower = stand_on_ground(rectangle, z, ground_elevation, settings)
         nearest = jnp.hypot(*_distances_outside(rectangle))
         reach = NOT_CUT_M * jnp.ones_like(ground) if steepest is None else steepest * nearest - ground
         row = rectangle, label, cluster, score, measured[:, 1], is_open, around, in_threes
         candidates = _finish(row, reach, clusters, settings)
-        return dataclasses.replace(candidates, bottom=candidates.bottom + ground)
+        bottom, height = candidates.bottom + ground - lower, candidates.height + lower
+        return dataclasses.replace(candidates, bottom=bottom, height=height)
 
     # Many at a time where they are looked up in the ground grid, see `map_rows`.
     chunk = chunks.BOXES if config.ground.surface else 1
@@ -333,6 +338,39 @@ def end_where_seen(
     shift = jnp.sign(sensor_from(rectangles)[0]) * (length - answered) / 2
     ended = jnp.stack([x + shift * jnp.cos(yaw), y + shift * jnp.sin(yaw), answered, width, yaw], axis=1)
     return ended, sure
+
+
+def stand_on_ground(
+    rectangles: jax.Array, z: jax.Array, ground_elevation: GroundElevation, config: VehicleConfig
+) -> tuple[jax.Array, jax.Array]:
+    """Where vehicles stand: far ones lower than what is taken for the ground below their middle.
+
+    No ground is seen below them; and a beam that grazes the ground returns from where its lower edge meets
+    it, nearer and so higher than its middle says.
+
+    Args:
+      rectangles: (P, 5) float32: x, y, length, width (m), yaw (rad).
+      z: (P,) float32, m: tells which of several planes a vehicle stands on.
+      ground_elevation: asks for the ground under points.
+      config: from which range on they stand on the ground before them, where that is lower, and lower by how
+        much for each metre more. Without ``neighbourhood`` none does.
+
+    Returns:
+      ground: (P,) float32, m: z of the ground below the middle.
+      lower: (P,) float32, m, 0 or above.
+
+    Reference: oracle `jaxbox.reference.stand_on_ground`.
+    """
+    middle = rectangles[:, :2]
+    if not config.neighbourhood:
+        return ground_elevation(jnp.concatenate([middle, z[:, None]], axis=1)), jnp.zeros_like(z)
+    rho, nearest = jnp.linalg.norm(middle, axis=1), jnp.hypot(*_distances_outside(rectangles))
+    before = middle * (jnp.maximum(nearest - BEFORE_M, 0) / jnp.maximum(rho, 1e-3))[:, None]
+    places = jnp.concatenate([jnp.concatenate([place, z[:, None]], axis=1) for place in (middle, before)])
+    ground, ground_before = jnp.split(ground_elevation(places), 2)
+    beyond = jnp.maximum(rho - config.far_ground_from_m, 0)
+    lower = jnp.maximum(ground - ground_before, 0) * jnp.minimum(beyond / FAR_RAMP_M, 1)
+    return ground, lower + config.far_ground_rise * beyond
 
 
 def neighbourhood_score(
