@@ -247,7 +247,7 @@ def test_far_vehicles_stand_where_the_reference_says():
     boxes = np.column_stack([place, size, yaw]).astype(np.float32)
     z = rng.uniform(-2, 1, MAX_BOXES).astype(np.float32)
 
-    stand = jax.jit(lambda *rows: scoring.stand_on_ground(*rows, hilly, SETTINGS))
+    stand = jax.jit(lambda *rows: _surroundings.stand_on_ground(*rows, hilly, SETTINGS))
     ground, lower = stand(boxes, z)
     rows = zip(boxes.astype(float), z.astype(float), strict=True)
     expected = np.array([reference.stand_on_ground(*row, hilly, SETTINGS) for row in rows])
@@ -258,7 +258,7 @@ def test_far_vehicles_stand_where_the_reference_says():
     assert (expected[far > 0, 1] >= SETTINGS.far_ground_rise * far[far > 0] - 1e-6).all()
     assert (expected[:, 1] > SETTINGS.far_ground_rise * np.maximum(far, 0) + 0.01).sum() > 20
     alone = dataclasses.replace(SETTINGS, neighbourhood=False)
-    assert not np.any(scoring.stand_on_ground(boxes, z, hilly, alone)[1])
+    assert not np.any(_surroundings.stand_on_ground(boxes, z, hilly, alone)[1])
 
 
 def test_overlap_of_boxes_is_that_of_opencv(cases):

@@ -9,7 +9,6 @@ from jaxbox.reference.assembly import (
     ReferenceDetections,
     assemble,
     assign_points,
-    stand_on_ground,
 )
 from jaxbox.reference.clustering import (
     compress_range,
@@ -171,6 +170,7 @@ from jaxbox.reference.surroundings import (
     distance_outside,
     is_behind,
     sensor_outside,
+    stand_on_ground,
     top_of,
 )
 from jaxbox.reference.tracking import (

@@ -8,7 +8,6 @@ import numpy as np
 
 from jaxbox.config import DetectorConfig, VehicleConfig
 from jaxbox.reference.completion import is_large
-from jaxbox.reference.evidence import GroundElevation
 from jaxbox.reference.fronts import find_fronts
 from jaxbox.reference.ground import ground_elevation
 from jaxbox.reference.hull import sampled_points
@@ -25,13 +24,10 @@ from jaxbox.reference.state import (
     ShapeDescriptors,
     Sweep,
 )
-from jaxbox.reference.surroundings import distance_outside, sensor_outside
+from jaxbox.reference.surroundings import distance_outside, stand_on_ground
 
 INSIDE_TOLERANCE_M = 1e-3
 """A detection's points may lie this far outside its box: the box goes through the outermost of them."""
-
-BEFORE_M, FAR_RAMP_M = 1.0, 15.0
-"""Far vehicles stand on the ground so much before them, in full from so much beyond the least range on."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,32 +194,6 @@ def _vertical(winner: Candidate, found: Found, config: DetectorConfig) -> tuple[
     ground_z, lower = stand_on_ground(winner.completed.box, z, elevation, config.vehicles)
     bottom, height = _standing(winner, cluster, config.vehicles)
     return ground_z + bottom + (height - lower) / 2, height + lower
-
-
-def stand_on_ground(
-    box: np.ndarray, z: float, elevation: GroundElevation, config: VehicleConfig
-) -> tuple[float, float]:
-    """Where a vehicle stands: lower, where it is far, than the ground below its middle.
-
-    Args:
-      box: (5,): x, y, length, width in m and yaw in rad.
-      z: m: tells which of several planes it stands on.
-      elevation: z of the ground, m, under points.
-      config: from `far_ground_from_m` on it stands on the ground `BEFORE_M` before it, where that is lower,
-        in full `FAR_RAMP_M` farther, and lower by `far_ground_rise` for each metre.
-
-    Returns:
-      z of the ground below its middle, and how much lower it stands, m.
-    """
-    ground = float(elevation(np.array([[*box[:2], z]]))[0])
-    if not config.neighbourhood:
-        return ground, 0.0
-    rho = float(np.hypot(*box[:2]))
-    away = max(float(np.hypot(*sensor_outside(box))) - BEFORE_M, 0.0)
-    before = float(elevation(np.array([[*(box[:2] * away / max(rho, 1e-3)), z]]))[0])
-    beyond = max(rho - float(config.far_ground_from_m), 0.0)
-    rise = max(ground - before, 0.0) * min(beyond / FAR_RAMP_M, 1.0)
-    return ground, rise + float(config.far_ground_rise) * beyond
 
 
 def _standing(winner: Candidate, cluster: Cluster, config: VehicleConfig) -> tuple[float, float]:

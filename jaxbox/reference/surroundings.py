@@ -1,4 +1,6 @@
-"""What surrounds a box: the points of the whole sweep in it, above it and round it."""
+"""What surrounds a box: the points of the whole sweep in it, above it and round it, and the ground below."""
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -14,6 +16,8 @@ OVERHANGS_M = 0.6, 0.3
 ends speak against it."""
 LOWEST_LEVEL = 0.4
 """Where the levels begin, as a share of the highest that points of the vehicle may have."""
+BEFORE_M, FAR_RAMP_M = 1.0, 15.0
+"""Far vehicles stand on the ground so much before them, in full from so much beyond the least range on."""
 
 
 def distance_outside(xy: np.ndarray, box: np.ndarray) -> np.ndarray:
@@ -191,6 +195,32 @@ def sensor_outside(box: np.ndarray) -> np.ndarray:
     [8.0, 0.0]
     """
     return np.maximum(np.abs(in_box_frame(np.zeros(2), box)) - box[2:4] / 2, 0)
+
+
+def stand_on_ground(
+    box: np.ndarray, z: float, elevation: Callable[[np.ndarray], np.ndarray], config: VehicleConfig
+) -> tuple[float, float]:
+    """Where a vehicle stands: lower, where it is far, than the ground below its middle.
+
+    Args:
+      box: (5,): x, y, length, width in m and yaw in rad.
+      z: m: tells which of several planes it stands on.
+      elevation: z of the ground, m, under points.
+      config: from `far_ground_from_m` on it stands on the ground `BEFORE_M` before it, where that is lower,
+        in full `FAR_RAMP_M` farther, and lower by `far_ground_rise` for each metre.
+
+    Returns:
+      z of the ground below its middle, and how much lower it stands, m.
+    """
+    ground = float(elevation(np.array([[*box[:2], z]]))[0])
+    if not config.neighbourhood:
+        return ground, 0.0
+    rho = float(np.hypot(*box[:2]))
+    away = max(float(np.hypot(*sensor_outside(box))) - BEFORE_M, 0.0)
+    before = float(elevation(np.array([[*(box[:2] * away / max(rho, 1e-3)), z]]))[0])
+    beyond = max(rho - float(config.far_ground_from_m), 0.0)
+    rise = max(ground - before, 0.0) * min(beyond / FAR_RAMP_M, 1.0)
+    return ground, rise + float(config.far_ground_rise) * beyond
 
 
 def in_box_frame(xy: np.ndarray, box: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What surrounds a box: the points of the whole sweep in it, above it and round it."""
+"""What surrounds a box: the points of the whole sweep in it, above it and round it, and the ground below."""
 
 import math
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.config import ClassPrior, RegionConfig, VehicleConfig
-from jaxbox.stages.state import NeighbourhoodCounts, Obstacles
+from jaxbox.stages.state import GroundElevation, NeighbourhoodCounts, Obstacles
 from jaxbox.xla import chunks
 from jaxbox.xla.indexing import gather, scatter
 from jaxbox.xla.loops import map_rows
@@ -44,6 +44,10 @@ END_OVERHANG_M, SIDE_OVERHANG_M = 0.6, 0.3
 """Where points past the ends speak against a vehicle (`ClassPrior.past_ends_m`), those up to here before the
 end and the side that the sensor sees are its own: bodies reach beyond the bumpers and sills that a box is
 fitted to."""
+
+
+BEFORE_M, FAR_RAMP_M = 1.0, 15.0
+"""Far vehicles stand on the ground so much before them, in full from so much beyond the least range on."""
 
 
 def count_points_around(
@@ -142,6 +146,55 @@ def sensor_from(boxes: jax.Array) -> tuple[jax.Array, jax.Array]:
     x, y, _, _, yaw = boxes.T
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     return -(x * cos + y * sin), x * sin - y * cos
+
+
+def sensor_outside(boxes: jax.Array) -> list[jax.Array]:
+    """How far the sensor, at the origin, is outside boxes.
+
+    Args:
+      boxes: (P, 5) float32: x, y, length, width (m), yaw (rad).
+
+    Returns:
+      (P,) float32 each, m: along and across; 0 where it is beside them.
+
+    Reference: oracle `jaxbox.reference.sensor_outside`.
+    """
+    half = boxes[:, 2:4].T / 2
+    sensor = sensor_from(boxes)
+    return [jnp.maximum(jnp.abs(place) - size, 0) for place, size in zip(sensor, half, strict=True)]
+
+
+def stand_on_ground(
+    rectangles: jax.Array, z: jax.Array, ground_elevation: GroundElevation, config: VehicleConfig
+) -> tuple[jax.Array, jax.Array]:
+    """Where vehicles stand: far ones lower than what is taken for the ground below their middle.
+
+    No ground is seen below them; and a beam that grazes the ground returns from where its lower edge meets
+    it, nearer and so higher than its middle says.
+
+    Args:
+      rectangles: (P, 5) float32: x, y, length, width (m), yaw (rad).
+      z: (P,) float32, m: tells which of several planes a vehicle stands on.
+      ground_elevation: asks for the ground under points.
+      config: from which range on they stand on the ground before them, where that is lower, and lower by how
+        much for each metre more. Without ``neighbourhood`` none does.
+
+    Returns:
+      ground: (P,) float32, m: z of the ground below the middle.
+      lower: (P,) float32, m, 0 or above.
+
+    Reference: oracle `jaxbox.reference.stand_on_ground`.
+    """
+    middle = rectangles[:, :2]
+    if not config.neighbourhood:
+        return ground_elevation(jnp.concatenate([middle, z[:, None]], axis=1)), jnp.zeros_like(z)
+    rho, nearest = jnp.linalg.norm(middle, axis=1), jnp.hypot(*sensor_outside(rectangles))
+    before = middle * (jnp.maximum(nearest - BEFORE_M, 0) / jnp.maximum(rho, 1e-3))[:, None]
+    places = jnp.concatenate([jnp.concatenate([place, z[:, None]], axis=1) for place in (middle, before)])
+    ground, ground_before = jnp.split(ground_elevation(places), 2)
+    beyond = jnp.maximum(rho - config.far_ground_from_m, 0)
+    lower = jnp.maximum(ground - ground_before, 0) * jnp.minimum(beyond / FAR_RAMP_M, 1)
+    return ground, lower + config.far_ground_rise * beyond
 
 
 def _frames(

@@ -14,7 +14,13 @@ from jaxbox.stages._assignments import share_of_length_seen
 from jaxbox.stages._priors import asymmetric_gaussian, closed_free_length, prior_of, size_score
 from jaxbox.stages._rows import find_lines, hit_share
 from jaxbox.stages._suppression import non_max_suppression
-from jaxbox.stages._surroundings import cluster_alone, count_points_around, sensor_from
+from jaxbox.stages._surroundings import (
+    cluster_alone,
+    count_points_around,
+    sensor_from,
+    sensor_outside,
+    stand_on_ground,
+)
 from jaxbox.stages.state import (
     NOT_A_BOX,
     Boxes,
@@ -51,10 +57,6 @@ BUMPER_RAMP_M = 10.0
 
 NEARLY_WIDE = 0.6, 0.8
 """Between these measured fractions of the class's width a bumper is believed to be one, and a rear whole."""
-
-
-BEFORE_M, FAR_RAMP_M = 1.0, 15.0
-"""Far vehicles stand on the ground so much before them, in full from so much beyond the least range on."""
 
 
 WIDE = 0.4
@@ -127,7 +129,7 @@ def score_boxes(
             score = score * (seen + settings.hidden_length_score * (1 - seen))
         z = jnp.zeros_like(rectangle[:, 0]) if lowest_z is None else take(lowest_z, cluster)
         ground, lower = stand_on_ground(rectangle, z, ground_elevation, settings)
-        nearest = jnp.hypot(*_distances_outside(rectangle))
+        nearest = jnp.hypot(*sensor_outside(rectangle))
         reach = NOT_CUT_M * jnp.ones_like(ground) if steepest is None else steepest * nearest - ground
         row = rectangle, label, cluster, score, measured[:, 1], is_open, around, in_threes
         candidates = _finish(row, reach, clusters, settings)
@@ -194,13 +196,6 @@ def _look_around(
     sure = early * jnp.minimum(num_points / config.vehicles.saturation_points, 1) ** 2
     around = count_points_around(rectangle, prior, sure, num, obstacles, config.vehicles, config.region)
     return around.with_ring(jnp.where(in_threes, 1 - sure, 1) * around.num_ring)
-
-
-def _distances_outside(rectangles: jax.Array) -> list[jax.Array]:
-    """(P,) m each: how far the sensor is from rectangles (P, 5), along and across."""
-    half = rectangles[:, 2:4].T / 2
-    sensor = sensor_from(rectangles)
-    return [jnp.maximum(jnp.abs(place) - size, 0) for place, size in zip(sensor, half, strict=True)]
 
 
 def _end_where_seen(
@@ -327,7 +322,7 @@ def end_where_seen(
     Reference: oracle `jaxbox.reference.end_where_seen`.
     """
     x, y, length, width, yaw = rectangles.T
-    along, across = _distances_outside(rectangles)
+    along, across = sensor_outside(rectangles)
     steep = jnp.minimum(across / jnp.maximum(along, 1e-3) / config.end_slope, 1)
     whole = share_of_length_seen(around.deepest, prior, config.end_length)
     dense = around.num_inside / (around.num_inside + config.end_points)
@@ -338,39 +333,6 @@ def end_where_seen(
     shift = jnp.sign(sensor_from(rectangles)[0]) * (length - answered) / 2
     ended = jnp.stack([x + shift * jnp.cos(yaw), y + shift * jnp.sin(yaw), answered, width, yaw], axis=1)
     return ended, sure
-
-
-def stand_on_ground(
-    rectangles: jax.Array, z: jax.Array, ground_elevation: GroundElevation, config: VehicleConfig
-) -> tuple[jax.Array, jax.Array]:
-    """Where vehicles stand: far ones lower than what is taken for the ground below their middle.
-
-    No ground is seen below them; and a beam that grazes the ground returns from where its lower edge meets
-    it, nearer and so higher than its middle says.
-
-    Args:
-      rectangles: (P, 5) float32: x, y, length, width (m), yaw (rad).
-      z: (P,) float32, m: tells which of several planes a vehicle stands on.
-      ground_elevation: asks for the ground under points.
-      config: from which range on they stand on the ground before them, where that is lower, and lower by how
-        much for each metre more. Without ``neighbourhood`` none does.
-
-    Returns:
-      ground: (P,) float32, m: z of the ground below the middle.
-      lower: (P,) float32, m, 0 or above.
-
-    Reference: oracle `jaxbox.reference.stand_on_ground`.
-    """
-    middle = rectangles[:, :2]
-    if not config.neighbourhood:
-        return ground_elevation(jnp.concatenate([middle, z[:, None]], axis=1)), jnp.zeros_like(z)
-    rho, nearest = jnp.linalg.norm(middle, axis=1), jnp.hypot(*_distances_outside(rectangles))
-    before = middle * (jnp.maximum(nearest - BEFORE_M, 0) / jnp.maximum(rho, 1e-3))[:, None]
-    places = jnp.concatenate([jnp.concatenate([place, z[:, None]], axis=1) for place in (middle, before)])
-    ground, ground_before = jnp.split(ground_elevation(places), 2)
-    beyond = jnp.maximum(rho - config.far_ground_from_m, 0)
-    lower = jnp.maximum(ground - ground_before, 0) * jnp.minimum(beyond / FAR_RAMP_M, 1)
-    return ground, lower + config.far_ground_rise * beyond
 
 
 def neighbourhood_score(
