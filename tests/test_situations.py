@@ -27,7 +27,6 @@ IN_SHORT = {
     "rows, side by side: gaps of 0.2 m": 5,
     "rows, side by side: gaps of 0.3 m": 5,
     "rows, nose to tail: gaps of 0.2 m": 5,
-    "rows, nose to tail: gaps of 0.3 m": 5,
     "very near: middle 3 m away": 13,
     "under a ceiling: 2.3 m": 6,
     "under a ceiling: 3 m": 6,

@@ -375,7 +375,7 @@ class VehicleConfig:
     far_ground_rise: Scalar = 0.002
     """m/m: and lower by this times the range beyond. A beam that grazes the ground returns from where its
     lower edge meets it, nearer and so higher than its middle says."""
-    min_extent_m: Scalar = 0.8
+    min_extent_m: Scalar = 1.0
     """Boxes with no measured extent as long as this, and clusters with such a diagonal, are not vehicles."""
     min_lone_extent_m: Scalar = 1.0
     """Nor are boxes with no measured extent as long as this, unless they are in a row or a line of three or
