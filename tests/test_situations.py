@@ -11,7 +11,6 @@ import pytest
 
 from benchmarks import bench_situations, common
 from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig, Label, PointCloud, Status, detect
-from jaxbox.config.fields import replace_fields
 from jaxbox.evaluation.iou import pairwise_overlaps
 from jaxbox.synthetic import TruthBoxes, make_sweep
 from jaxbox.synthetic.scene import outline
@@ -122,32 +121,13 @@ def test_what_is_counted_is_what_is_worked_out_by_hand(status):
 
 @pytest.fixture(scope="module")
 def find():
-    def find(xyz, config=None):
-        return detect(
-            PointCloud.from_numpy(xyz, capacity=bench_situations.CAPACITY), config or DetectorConfig()
-        )
-
-    return find
+    config = DetectorConfig()
+    return lambda xyz: detect(PointCloud.from_numpy(xyz, capacity=bench_situations.CAPACITY), config)
 
 
 @pytest.mark.parametrize("title", IN_SHORT)
 def test_what_is_said_to_be_found_is_found(title, find):
     assert bench_situations.measure(BY_TITLE[title], find)["found"] >= IN_SHORT[title]
-
-
-@pytest.mark.parametrize("group", ["rows, side by side", "rows, nose to tail"])
-def test_slivers_are_vehicles_in_rows_and_lines_alone(group, find):
-    """All boxes are slivers here: those in rows and lines stay where they were, the others are none."""
-    slivers = replace_fields(DetectorConfig(), {"vehicles.min_lone_extent_m": 1000.0})
-    row, street = (
-        next(iter(BY_TITLE[title].sweeps()))[0]
-        for title in (f"{group}: gaps of 0.5 m", "open street: as it is")
-    )
-    found, stay = (find(row, config).on_host().above(DEFAULT_SCORE_THRESHOLD) for config in (None, slivers))
-    assert 4 <= len(stay) <= len(found) == 5
-    assert {center.tobytes() for center in stay.center} <= {center.tobytes() for center in found.center}
-    assert len(find(street).on_host().above(DEFAULT_SCORE_THRESHOLD)) == 10
-    assert len(find(street, slivers).on_host().above(DEFAULT_SCORE_THRESHOLD)) == 0
 
 
 @pytest.mark.parametrize("seed", [0, 3])
