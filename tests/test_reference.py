@@ -1042,10 +1042,16 @@ def test_what_may_be_a_wall_is_a_truck_as_far_as_beams_pass_below():
         {"around": reference.cluster_alone(9, 0.92)},
         {"around": reference.cluster_alone(9, 2.3)},
         {"measured": (0.99, 0.99)},
+        {"measured": (0.59, 0.59), "in_threes": True},
     ],
 )
 def test_each_gate_closes(fault):
     assert score_of(**fault) == 0
+
+
+@pytest.mark.parametrize("fault", [{"measured": (1.0, 0.0)}, {"measured": (0.6, 0.6), "in_threes": True}])
+def test_the_gate_on_extent_is_lower_in_rows(fault):
+    assert score_of(**fault) > 0.1
 
 
 def test_overlap_is_one_on_itself_symmetric_and_that_of_two_squares_at_45_degrees():

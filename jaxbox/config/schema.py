@@ -376,7 +376,10 @@ class VehicleConfig:
     """m/m: and lower by this times the range beyond. A beam that grazes the ground returns from where its
     lower edge meets it, nearer and so higher than its middle says."""
     min_extent_m: Scalar = 1.0
-    """Boxes with no measured extent as long as this, and clusters with such a diagonal, are not vehicles."""
+    """Boxes with no measured extent as long as this, and clusters with no such diagonal, are not vehicles."""
+    min_row_extent_m: Scalar = 0.6
+    """The same of boxes of the first class in a row or a line of three or more: a gap in the returns of one
+    that is seen from its end cuts slivers off."""
     saturation_points: Scalar = 100.0
     """Clusters with at least that many points lose no score for sparseness."""
     sparseness_power: Scalar = 0.3
@@ -389,8 +392,8 @@ class VehicleConfig:
     """score x exp(-weight x points above / points), where those above are connected to the vehicle."""
     hidden_length_score: Scalar = 0.7
     """score x this where neither a measured side (``completion.seen_length``) nor a seen end
-    (``completion.end_length``) shows the length, x 1 where one does, and between by degree. Not in mode
-    "none", nor without ``neighbourhood``."""
+    (``completion.end_length``) shows the length, x 1 where one does, and between by degree; x 1 for boxes
+    shorter than ``min_extent_m``. Not in mode "none", nor without ``neighbourhood``."""
     unseen_top_score: Scalar = 0.7
     """Score of the height where the top is out of sight, so that the class's height is answered: where the
     highest beam cuts a vehicle off, less where less than half of the class's width was measured; and where

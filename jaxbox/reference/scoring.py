@@ -68,12 +68,14 @@ def score_boxes(
 
     def judge(row: int, hypothesis: ClassHypothesis, box: CompletedBox) -> Candidate:
         cluster, prior = clusters[hypothesis.cluster], config.vehicles.classes[hypothesis.label]
-        score = float(early[row])
-        threes = bool(in_threes[row])
+        score, threes = float(early[row]), bool(in_threes[row])
         around = _look_around(box.box, prior, cluster, score, threes, obstacles, config.vehicles)
+        is_sliver = box.longest_m < config.vehicles.min_extent_m
+        score = 0.0 if is_sliver and not threes else score
         if config.vehicles.neighbourhood and config.completion.mode != "none":
             ended, seen = _end_where_seen(box, around, prior, config)
             box = box if box.in_row else dataclasses.replace(box, box=ended)
+            seen = 1.0 if is_sliver else seen
             score *= seen + float(config.vehicles.hidden_length_score) * (1 - seen)
         rho = float(np.hypot(box.box[0], box.box[1]))
         lowest_z = obstacles.xyz[cluster.members, 2].min() if config.ground.max_planes > 1 else 0.0
@@ -261,6 +263,8 @@ def score_box(
     Returns:
       The score, without what a hidden length costs; 0 where a gate of the class closes.
     """
+    if box.longest_m < config.min_extent_m and not in_threes:
+        return 0.0
     early = early_score(
         box,
         prior,
@@ -287,7 +291,7 @@ def early_score(
     config: VehicleConfig,
 ) -> float:
     """The part of the score that needs no look at what surrounds the box; see `score_box`."""
-    if max(box.measured_length_m, box.measured_width_m) < config.min_extent_m:
+    if box.longest_m < config.min_row_extent_m:
         return 0.0
     rho = float(np.hypot(box.box[0], box.box[1]))
     score = evidence_score(num_points, hit, free_length, support, rho, box.objective, config)

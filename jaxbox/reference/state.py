@@ -184,6 +184,11 @@ class CompletedBox:
     in_row: bool = False
     """Whether it stands side by side with others, which hide its sides."""
 
+    @property
+    def longest_m(self) -> float:
+        """The longer of the two measured extents."""
+        return max(self.measured_length_m, self.measured_width_m)
+
 
 @dataclasses.dataclass(frozen=True)
 class ClassHypothesis:

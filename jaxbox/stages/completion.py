@@ -132,7 +132,9 @@ def list_hypotheses(
     def may_be(rows: tuple[jax.Array, ...]) -> jax.Array:
         is_large, high, *each = rows
         rectangles = [Rectangles(rows) for rows in each]
-        sizes_fit = [_may_fit(prior, rectangles, config) for prior in config.classes]
+        # Only the first class stands in rows.
+        least = [config.min_row_extent_m, *[config.min_extent_m] * (num_classes - 1)]
+        sizes_fit = [_may_fit(prior, rectangles, m) for prior, m in zip(config.classes, least, strict=True)]
         tried = jnp.stack([sizes_fit[0], *(is_large & other for other in sizes_fit[1:])], axis=1)
         return tried & _may_be_high_enough(high[:, 2], rectangles[0], config)[:, None]
 
@@ -145,13 +147,15 @@ def list_hypotheses(
     return ClassHypotheses(jnp.where(is_row, cluster, capacity), jnp.where(is_row, label, 0), num)
 
 
-def _may_fit(prior: ClassPrior, candidates: Sequence[Rectangles], config: VehicleConfig) -> jax.Array:
+def _may_fit(
+    prior: ClassPrior, candidates: Sequence[Rectangles], min_extent_m: jax.Array | float
+) -> jax.Array:
     """(P,) whether some rectangle of a cluster fits into a class, and is large enough to be judged."""
     fits = jnp.zeros_like(candidates[0].angle, bool)
     for rectangles in candidates:
         long, short = longest_side(rectangles), jnp.min(rectangles.high - rectangles.low, axis=1)
         small = (long <= prior.max_length_m) & (short <= prior.max_width_m)
-        fits = fits | (small & (long >= config.min_extent_m))
+        fits = fits | (small & (long >= min_extent_m))
     return fits
 
 

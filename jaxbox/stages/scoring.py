@@ -119,9 +119,13 @@ def score_boxes(
 
     def finish(rows: tuple[Any, ...]) -> Candidates:
         rectangle, label, cluster, score, measured, in_row, is_open, around, in_threes = rows
+        # Slivers stand in rows and lines, or are none: the others there show how long they are.
+        is_sliver = jnp.max(measured, axis=1) < settings.min_extent_m
+        score = jnp.where(is_sliver & ~in_threes, 0, score)
         if config.vehicles.neighbourhood and config.completion.mode != "none":
             ended, seen = _end_where_seen(rectangle, label, measured[:, 0], around, config)
             rectangle = jnp.where(in_row[:, None], rectangle, ended)
+            seen = jnp.where(is_sliver, 1, seen)
             score = score * (seen + settings.hidden_length_score * (1 - seen))
         z = jnp.zeros_like(rectangle[:, 0]) if lowest_z is None else take(lowest_z, cluster)
         ground, lower = stand_on_ground(rectangle, z, ground_elevation, settings)
@@ -162,7 +166,7 @@ def _early_scores(
         by_evidence = evidence_score(num_points, hit, free_length, support, rho, boxes.objective, config)
         by_size = size_score(boxes.length, boxes.width, prior)
         score = by_evidence * by_size * prior.prior_weight
-        large_enough = jnp.max(boxes.measured, axis=1) >= config.min_extent_m
+        large_enough = jnp.max(boxes.measured, axis=1) >= config.min_row_extent_m
         return jnp.where((boxes.objective > NOT_A_BOX) & large_enough, score, 0)
 
     rows = completed.boxes, hypotheses.label, hypotheses.cluster, rays
