@@ -106,9 +106,10 @@ def _with_strays(
     along_scene = config.box.scene_direction and config.completion.along_scene
     if not along_scene:
         return [best_rectangles(rotations, preference)]
+    widest, max_loss = float(config.vehicles.classes[0].max_width_m), float(config.box.second_peak_loss)
     second = [
         dataclasses.replace(
-            each, curve=second_peak(each.curve, each.num_points, max_loss=float(config.box.second_peak_loss))
+            each, curve=second_peak(each.curve, each.short_m <= widest, each.num_points, max_loss=max_loss)
         )
         for each in rotations
     ]
@@ -189,11 +190,13 @@ def _apart_deg(first: int | np.ndarray, second: int, num_angles: int) -> np.ndar
     return np.minimum(turn, num_angles - turn) * 90 / num_angles
 
 
-def second_peak(curve: np.ndarray, num_points: int, *, max_loss: float) -> np.ndarray:
+def second_peak(curve: np.ndarray, narrow: np.ndarray, num_points: int, *, max_loss: float) -> np.ndarray:
     """The peaks of a curve that are 6 degrees or more from its best rotation.
 
     Args:
       curve: (A,) larger is better.
+      narrow: (A,) bool, rotations at which the rectangle is no wider than a car; others count only if all
+        are wider.
       num_points: that it is of.
       max_loss: how much worse another peak may be.
 
@@ -202,8 +205,9 @@ def second_peak(curve: np.ndarray, num_points: int, *, max_loss: float) -> np.nd
     """
     apart_deg = _apart_deg(np.arange(len(curve)), int(np.argmax(curve)), len(curve))
     is_peak = curve >= np.maximum(np.roll(curve, 1), np.roll(curve, -1))
-    others = np.where(is_peak & (apart_deg >= 6), curve, -np.inf)
-    return others if num_points >= 30 and others.max() > curve.max() - max_loss else curve
+    allowed = np.where(narrow | ~narrow.any(), curve, -np.inf)
+    others = np.where(is_peak & (apart_deg >= 6), allowed, -np.inf)
+    return others if num_points >= 30 and others.max() > allowed.max() - max_loss else curve
 
 
 def try_rotations(xy: np.ndarray, config: BoxConfig) -> tuple[np.ndarray, np.ndarray]:

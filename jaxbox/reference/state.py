@@ -98,6 +98,12 @@ class Rotations:
     principal: int
     """The rotation along the principal axes of the points, see `principal_rotations`."""
 
+    @property
+    def short_m(self) -> np.ndarray:
+        """(A,) m: the shorter side at each rotation."""
+        u0, u1, v0, v1 = self.extents.T
+        return np.minimum(u1 - u0, v1 - v0)
+
 
 @dataclasses.dataclass(frozen=True)
 class Rectangle:

@@ -117,7 +117,9 @@ def _candidate_columns(
     def bound(columns: tuple[jax.Array, ...]) -> list[jax.Array]:
         curve, extents, num_points, principal = columns
         best, _ = first_argmax(curve)
-        peak = second_peak(curve, num_points[0], max_loss=config.box.second_peak_loss)
+        low_u, high_u, low_v, high_v = extents
+        narrow = jnp.minimum(high_u - low_u, high_v - low_v) <= config.vehicles.classes[0].max_width_m
+        peak = second_peak(curve, narrow, num_points[0], max_loss=config.box.second_peak_loss)
         along = along_axis(best, principal[0], num_points[0], curve.shape[0], config.box.min_axis_points)
         found = [
             rectangles_at(best, curve, extents, preference),
@@ -228,15 +230,18 @@ def _apart_deg(first: jax.Array, second: jax.Array, num_angles: int) -> jax.Arra
     return jnp.minimum(turn, num_angles - turn).astype(jnp.float32) * (90 / num_angles)
 
 
-def second_peak(curve: jax.Array, num_points: jax.Array, *, max_loss: Scalar) -> jax.Array:
+def second_peak(curve: jax.Array, narrow: jax.Array, num_points: jax.Array, *, max_loss: Scalar) -> jax.Array:
     """The peaks of curves apart from their best rotation, where one of them is nearly as good.
 
-    A vehicle that is seen in part may fit nearly as well at two rotations, and a little noise decides.
+    A vehicle that is seen in part, or is near and rounded, may fit nearly as well at two rotations or three,
+    and a little noise decides. The best may be askew: too wide for any car.
 
     Args:
       curve: (A, P) float32, see `try_rotations`.
+      narrow: (A, P) bool, whether the rectangle is no wider than a car at most: peaks elsewhere count only
+        where it is so at no rotation.
       num_points: (P,) int32, that they are of.
-      max_loss: () of the curve's value, from the best rotation to a peak that is nearly as good.
+      max_loss: () of the curve's value, from the best of those rotations to a peak that is nearly as good.
 
     Returns:
       (A, P) float32: minus infinity but at peaks apart from the best rotation. The curve itself of few
@@ -245,10 +250,12 @@ def second_peak(curve: jax.Array, num_points: jax.Array, *, max_loss: Scalar) ->
     Reference: oracle `jaxbox.reference.second_peak`.
     """
     num_angles = curve.shape[0]
-    best, greatest = first_argmax(curve)
+    best, _ = first_argmax(curve)
+    allowed = jnp.where(narrow | ~jnp.any(narrow, axis=0, keepdims=True), curve, -jnp.inf)
     apart_deg = _apart_deg(jnp.arange(num_angles, dtype=jnp.int32)[:, None], best[None], num_angles)
     is_peak = (curve >= jnp.roll(curve, 1, axis=0)) & (curve >= jnp.roll(curve, -1, axis=0))
-    others = jnp.where(is_peak & (apart_deg >= PEAKS_APART_DEG), curve, -jnp.inf)
+    others = jnp.where(is_peak & (apart_deg >= PEAKS_APART_DEG), allowed, -jnp.inf)
+    greatest = jnp.max(allowed, axis=0)
     has_other = (num_points >= MIN_PEAK_POINTS) & (jnp.max(others, axis=0) > greatest - max_loss)
     return jnp.where(has_other[None], others, curve)
 
