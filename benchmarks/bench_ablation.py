@@ -101,7 +101,7 @@ ABLATIONS = (
     }),
     Ablation("boxes along rows at no cost", {"completion.along_row_cost": 0.0}),
     Ablation("lines of vehicles nose to tail as others", {"vehicles.line_lengths": 0.0}),
-    Ablation("slivers in rows and lines are none", {"vehicles.min_row_extent_m": 1.0}),
+    Ablation("slivers in rows and lines are none", {"vehicles.row_extent": 1.0}),
     Ablation("evidence from 2 m on", {"evidence.min_range_m": 2.0}),
     Ablation("far vehicles stand on the ground below them", {"vehicles.far_ground_from_m": NO_LIMIT}),
     Ablation("no lowest box height", {"vehicles.classes.0.min_box_height_m": 0.0}),

@@ -142,7 +142,7 @@ def test_slivers_are_cars_in_rows_alone(find):
     row = BY_TITLE["rows, nose to tail: gaps of 0.3 m"]
     (scene,) = row.scenes
     alone = dataclasses.replace(row, scenes=(dataclasses.replace(scene, vehicles=scene.vehicles[3:4]),))
-    without = functools.partial(find, min_row_extent_m=1.0)
+    without = functools.partial(find, row_extent=1.0)
     assert [bench_situations.measure(row, each)["found"] for each in (find, without)] == [5, 4]
     for situation in (alone, BY_TITLE["open street: as it is"]):
         xyz, _ = situation.sweeps()[0]

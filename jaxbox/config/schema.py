@@ -377,9 +377,9 @@ class VehicleConfig:
     lower edge meets it, nearer and so higher than its middle says."""
     min_extent_m: Scalar = 1.0
     """Boxes with no measured extent as long as this, and clusters with no such diagonal, are not vehicles."""
-    min_row_extent_m: Scalar = 0.6
-    """The same of boxes of the first class in a row or a line of three or more: a gap in the returns of one
-    that is seen from its end cuts slivers off."""
+    row_extent: Scalar = 0.6
+    """In a row or a line of three or more, boxes of the first class count from this fraction of that extent
+    on: of one that is seen from its end, a gap in the returns cuts slivers off."""
     saturation_points: Scalar = 100.0
     """Clusters with at least that many points lose no score for sparseness."""
     sparseness_power: Scalar = 0.3

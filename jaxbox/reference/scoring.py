@@ -291,7 +291,7 @@ def early_score(
     config: VehicleConfig,
 ) -> float:
     """The part of the score that needs no look at what surrounds the box; see `score_box`."""
-    if box.longest_m < config.min_row_extent_m:
+    if box.longest_m < config.row_extent * config.min_extent_m:
         return 0.0
     rho = float(np.hypot(box.box[0], box.box[1]))
     score = evidence_score(num_points, hit, free_length, support, rho, box.objective, config)

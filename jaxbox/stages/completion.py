@@ -133,7 +133,7 @@ def list_hypotheses(
         is_large, high, *each = rows
         rectangles = [Rectangles(rows) for rows in each]
         # Only the first class stands in rows.
-        least = [config.min_row_extent_m, *[config.min_extent_m] * (num_classes - 1)]
+        least = [config.row_extent * config.min_extent_m, *[config.min_extent_m] * (num_classes - 1)]
         sizes_fit = [_may_fit(prior, rectangles, m) for prior, m in zip(config.classes, least, strict=True)]
         tried = jnp.stack([sizes_fit[0], *(is_large & other for other in sizes_fit[1:])], axis=1)
         return tried & _may_be_high_enough(high[:, 2], rectangles[0], config)[:, None]

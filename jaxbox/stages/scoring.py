@@ -166,7 +166,7 @@ def _early_scores(
         by_evidence = evidence_score(num_points, hit, free_length, support, rho, boxes.objective, config)
         by_size = size_score(boxes.length, boxes.width, prior)
         score = by_evidence * by_size * prior.prior_weight
-        large_enough = jnp.max(boxes.measured, axis=1) >= config.min_row_extent_m
+        large_enough = jnp.max(boxes.measured, axis=1) >= config.row_extent * config.min_extent_m
         return jnp.where((boxes.objective > NOT_A_BOX) & large_enough, score, 0)
 
     rows = completed.boxes, hypotheses.label, hypotheses.cluster, rays
