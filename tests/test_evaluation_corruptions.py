@@ -56,7 +56,9 @@ def test_each_severity_leaves_fewer_points(name, sweep):
     assert all(after < before for before, after in itertools.pairwise(counts))
 
 
-@pytest.mark.parametrize("name", ["noise", "clutter", "snow", "spray", "reflections", "speed", "turning"])
+@pytest.mark.parametrize(
+    "name", ["noise", "clutter", "snow", "spray", "reflections", "mirrored", "speed", "turning"]
+)
 def test_each_severity_moves_points_farther(name, sweep):
     moved = [
         np.linalg.norm(corrupted(name, sweep, a)[0] - sweep.xyz, axis=1).mean()
@@ -161,6 +163,23 @@ def test_spray_returns_from_within_its_plumes_alone(sweep):
     assert np.ptp(drops, axis=0).max() <= 2 * corruptions.PLUME_RADIUS_M
     assert abs(drops[:, 2] - corruptions.PLUME_Z_M).max() <= corruptions.PLUME_RADIUS_M
     np.testing.assert_allclose(xyz[intensity > 0], sweep.xyz[intensity > 0], rtol=1e-6)
+
+
+def test_images_lie_below_the_road_as_far_as_things_above_it_on_beams_that_met_it(sweep):
+    xyz, intensity = corrupted("mirrored", sweep, 0.02)
+    moved = (xyz != sweep.xyz).any(axis=1)
+    assert moved.sum() == round(0.02 * len(xyz))
+    np.testing.assert_array_equal(intensity, sweep.intensity)
+    met, image = sweep.xyz[moved].astype(float), xyz[moved].astype(float)
+    assert (met[:, 2] < -corruptions.ROAD_BELOW_M).all()
+    road_z = np.median(sweep.xyz[sweep.xyz[:, 2] < -corruptions.ROAD_BELOW_M, 2])
+    assert (image[:, 2] < road_z - corruptions.MIRRORED_FROM_M + 1e-4).all()
+    # Each is the image of a point of the sweep, seen where the beam went, beyond the road.
+    things = image * [1, 1, -1] + [0, 0, 2 * road_z]
+    assert max(np.linalg.norm(sweep.xyz - thing, axis=1).min() for thing in things) < 1e-3
+    cosine = (met * image).sum(axis=1) / (ranges(met) * ranges(image))
+    assert np.arccos(np.minimum(cosine, 1)).max() < 1.01 * corruptions.SAME_BEAM_RAD
+    assert (ranges(image) > ranges(met)).mean() > 0.9
 
 
 def test_motion_leaves_what_is_straight_ahead_and_carries_the_sides_by_the_way_gone():

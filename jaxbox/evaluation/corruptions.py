@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from jaxbox.evaluation.beams import beam_of_points
 
@@ -37,6 +38,12 @@ ROAD_BELOW_M = 1.3
 
 REFLECTION_DEPTHS_M = (0.2, 0.8)
 """How far below the road beams seem to end that it reflects."""
+
+MIRRORED_FROM_M = 0.3
+"""What stands higher above the road is mirrored in it."""
+
+SAME_BEAM_RAD = 0.01
+"""A beam that is nearer to the direction of a mirror image shows it, if it met the road."""
 
 RAIN_EXTINCTION, RAIN_NOISE = 0.01, 0.02
 """Goodin et al.: loss a metre at 1 mm/h, and the largest error of a range, as a share of it."""
@@ -269,6 +276,40 @@ def reflect_below_road(
     return moved, intensity
 
 
+def mirror_in_road(xyz: np.ndarray, intensity: np.ndarray, share: float, rng: np.random.Generator) -> Points:
+    """Lets some beams that meet the road end at the mirror image of what stands beyond, as on a wet road.
+
+    The image lies as far below the road, level for this, as the thing above it: the beam has gone as far.
+    Only beams that met the road show one.
+
+    Args:
+      xyz: (n, 3) m.
+      intensity: (n,).
+      share: of all points, 0 (none) to 1; no more than the road shows.
+      rng: draws which.
+
+    Returns:
+      As many points.
+    """
+    on_road, moved = xyz[:, 2] < -ROAD_BELOW_M, xyz.astype(np.float32)
+    if share == 0 or not on_road.any():
+        return moved, intensity
+    road_z = np.median(xyz[on_road, 2])
+    images = xyz[xyz[:, 2] > road_z + MIRRORED_FROM_M]
+    images[:, 2] = 2 * road_z - images[:, 2]
+    away, beam = map(np.asarray, KDTree(_directions(xyz)).query(_directions(images)))
+    seen = rng.permutation(np.flatnonzero((away < SAME_BEAM_RAD) & on_road[beam]))
+    # One image a beam.
+    _, first = np.unique(beam[seen], return_index=True)
+    chosen = rng.permutation(seen[first])[: round(share * len(xyz))]
+    moved[beam[chosen]] = images[chosen]
+    return moved, intensity
+
+
+def _directions(xyz: np.ndarray) -> np.ndarray:
+    return xyz / np.maximum(np.linalg.norm(xyz, axis=1, keepdims=True), np.finfo(np.float32).tiny)
+
+
 def drive_during_sweep(
     xyz: np.ndarray, intensity: np.ndarray, speed_m_s: float, rng: np.random.Generator
 ) -> Points:
@@ -412,6 +453,13 @@ CORRUPTIONS: dict[str, Corruption] = {
         none=0,
         amounts=(0.001, 0.002, 0.005, 0.01, 0.02),
         of_points=reflect_below_road,
+    ),
+    "mirrored": Corruption(
+        title="mirror images in the road",
+        unit="share of points",
+        none=0,
+        amounts=(0.001, 0.003, 0.01, 0.03, 0.06),
+        of_points=mirror_in_road,
     ),
     "speed": Corruption(
         title="driving during the sweep",
