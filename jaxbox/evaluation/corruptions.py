@@ -455,7 +455,7 @@ CORRUPTIONS: dict[str, Corruption] = {
         of_points=reflect_below_road,
     ),
     "mirrored": Corruption(
-        title="mirror images in the road",
+        title="mirror images",
         unit="share of points",
         none=0,
         amounts=(0.001, 0.003, 0.01, 0.03, 0.06),
