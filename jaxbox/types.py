@@ -83,8 +83,9 @@ _STATUS_TEXT = {
     "from afar, many from the air near by, or a blurred ground, and vehicles may be missing. Compare the "
     "counts with those of a good sweep; the limits are the settings under health.",
     Status.DOUBTFUL_GROUND: "the ground lies farther below the origin, or steeper, than a road lies under a "
-    "vehicle's sensor, or right under it where no sensor looks. The points are not in metres, the sensor is "
-    "tilted, or it is not at the origin; scale, turn or move them first.",
+    "vehicle's sensor, or right under it where no sensor looks, or many points lie below it. The points are "
+    "not in metres, the sensor is tilted, or it is not at the origin: scale, turn or move them first; or the "
+    "road lies on two levels, or is covered with water, and vehicles may be missing.",
 } | {bit: "; or ".join(row.overflow for row in rows) + "." for bit, rows in _OVERFLOW_ROWS.items()}
 
 
@@ -298,6 +299,9 @@ class Counts(ByValue):
     """() int32: those of them that lie more than 0.05 m off it."""
     points_under: jax.Array
     """() int32: points on the ground that are nearer, in the plane, than 0.6 of the sensor's height."""
+    points_below: jax.Array
+    """() int32: points 0.3 m or more below the ground, which count to `ground_points` too; 0 without the
+    ground grid."""
 
     @property
     def num_points(self) -> int:

@@ -89,12 +89,31 @@ def test_the_summary_has_the_figures_that_the_limits_are_for(street):
     assert clear.points_under == 0
 
 
-FIGURES = ("far_points", "scattered_azimuths", "near_ground_points", "rough_points", "points_under")
+FIGURES = (
+    "far_points",
+    "scattered_azimuths",
+    "near_ground_points",
+    "rough_points",
+    "points_under",
+    "points_below",
+)
 
 
-@pytest.mark.parametrize("kind", ["clear", "snow", "from below", "from a mast"])
+@pytest.mark.parametrize("height_m", ["0.6", "1"])
+def test_a_road_below_the_ground_that_was_found_is_doubted(height_m):
+    [(xyz, _)] = next(s for s in SITUATIONS if s.name == f"cars on a platform of {height_m} m").sweeps(
+        num_azimuths=900
+    )
+    detections = answer(xyz)
+    assert Status.DOUBTFUL_GROUND in Status(int(detections.status))
+    assert summarise(detections).returns.below_share > 2 * HealthConfig().max_below_share
+    assert Status.DOUBTFUL_GROUND not in doubts(xyz, max_below_share=1.0)
+
+
+@pytest.mark.parametrize("kind", ["clear", "snow", "mirrored", "from below", "from a mast"])
 def test_the_reference_counts_the_same(street, kind):
-    xyz = spoiled(street, "snow", 0.1) if kind == "snow" else street
+    amount = {"snow": 0.1, "mirrored": 0.03}.get(kind)
+    xyz = street if amount is None else spoiled(street, kind, amount)
     # Turned, as the beams of the street lie on the edges of azimuth cells.
     cos, sin = np.cos(0.001), np.sin(0.001)
     xyz = xyz @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
@@ -106,3 +125,4 @@ def test_the_reference_counts_the_same(street, kind):
         assert int(getattr(ours, name)) == pytest.approx(theirs[name], rel=0.001, abs=1), name
     assert int(ours.far_points) > 0
     assert (int(ours.points_under) > 0) == (kind == "from a mast")
+    assert (int(ours.points_below) > 0.01 * len(xyz)) == (kind == "mirrored")

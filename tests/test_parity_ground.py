@@ -9,8 +9,8 @@ import pytest
 
 from jaxbox import reference, synthetic
 from jaxbox.config import RegionConfig
-from jaxbox.evaluation.corruptions import reflect_below_road
-from jaxbox.stages import _sheets, filtering, ground
+from jaxbox.evaluation.corruptions import mirror_in_road, reflect_below_road
+from jaxbox.stages import _sheets, _support, filtering, ground
 from jaxbox.synthetic.terrain import SENSOR_HEIGHT_M
 
 GROUND = parity.CONFIG.ground
@@ -22,7 +22,7 @@ fit_ground_plane = parity.PerForm(ground.fit_ground_plane)
 fit_ground_surface = jax.jit(ground.fit_ground_surface)
 on_sheets = jax.jit(_sheets.on_sheets)
 planes_through_windows = jax.jit(_sheets.planes_through_windows)
-least_supported = jax.jit(ground.least_supported, static_argnums=(3, 4))
+least_supported = jax.jit(_support.least_supported, static_argnums=(3, 4), static_argnames="about_plane")
 height_above_ground = jax.jit(ground.height_above_ground)
 
 
@@ -52,15 +52,22 @@ def test_cell_minima_are_those_of_the_reference(cases):
         parity.assert_share(differ.sum(), len(differ), 2e-3, "cell minima")
 
 
-@pytest.mark.parametrize("levels", [ground.SENSOR_LEVELS, ground.PLANE_LEVELS], ids=["sensor", "plane"])
+@pytest.mark.parametrize("about_plane", [False, True], ids=["sensor", "plane"])
 @pytest.mark.parametrize("changes", [{}, {"min_support_share": 0.25, "min_support_points": 9.0}])
-def test_ground_has_the_support_that_the_reference_asks_for(cases, changes, levels):
+def test_ground_has_the_support_that_the_reference_asks_for(cases, changes, about_plane):
     config, halves_m = dataclasses.replace(GROUND, **changes), np.array([40.0, 20.0])
+    levels = _support.PLANE_LEVELS if about_plane else _support.SENSOR_LEVELS
     for case in cases:
         xyz = case.xyz[(np.abs(case.xyz[:, :2]) < halves_m).all(axis=1)]
-        expected = reference.least_supported(xyz[:, 2], xyz[:, :2], halves_m, levels, config)
+        # As if the plane were .5 m above the road.
+        xyz = xyz + np.float32([0, 0, about_plane * (SENSOR_HEIGHT_M - 0.5)])
+        expected = reference.least_supported(
+            xyz[:, 2], xyz[:, :2], halves_m, levels, config, about_plane=about_plane
+        )
         padded, mask = parity.pad(xyz, parity.CAPACITY), parity.padded_mask(len(xyz), parity.CAPACITY)
-        least = least_supported(padded[:, 2], padded[:, :2], mask, tuple(halves_m), levels, config)
+        least = least_supported(
+            padded[:, 2], padded[:, :2], mask, tuple(halves_m), levels, config, about_plane=about_plane
+        )
         assert np.unique(expected).size > 3
         np.testing.assert_allclose(np.asarray(least)[: len(xyz)], expected, atol=1e-6)
 
@@ -74,11 +81,25 @@ def test_few_returns_below_the_road_do_not_move_the_ground():
     square = np.abs(np.mgrid[-79.5:80, -79.5:80]).max(axis=0) < 20
     surfaces = {}
     for share in (0.0, config.min_support_share):
-        some = dataclasses.replace(config, min_support_share=share, min_support_points=40 * share)
+        asked = {"min_support_share": share, "min_support_points": 40 * share, "min_deep_share": 20 * share}
+        some = dataclasses.replace(config, **asked)
         surfaces[share] = np.asarray(fit_ground_surface(xyz, mask, plane, some))[square]
     clean = np.asarray(fit_ground_surface(sweep.xyz, mask, plane, config))[square]
     errors = {share: np.abs(surface - clean).mean() for share, surface in surfaces.items()}
     assert errors[config.min_support_share] < 0.03 < 0.2 < errors[0.0], errors
+
+
+def test_mirror_images_in_a_wet_road_do_not_move_the_ground_below_cars():
+    sweep = synthetic.make_sweep(5, num_azimuths=1000)
+    far = np.hypot(*sweep.xyz[:, :2].T) > 3
+    plane = np.array([[0, 0, -SENSOR_HEIGHT_M]], np.float32)
+    xyz, _ = mirror_in_road(sweep.xyz, sweep.intensity, 0.06, np.random.default_rng(0))
+    error_m = {}
+    for share in (0.0, GROUND.min_deep_share):
+        config = dataclasses.replace(GROUND, min_deep_share=share)
+        surface = fit_ground_surface(xyz, far, plane, config)
+        error_m[share] = np.abs(ground.surface_height(surface, sweep.boxes.center[:, :2], config)).max()
+    assert error_m[GROUND.min_deep_share] < 0.03 < 0.5 < error_m[0.0], error_m
 
 
 @pytest.mark.usefixtures("platform")

@@ -125,6 +125,9 @@ class GroundConfig:
     (.1 to .2 m); what lies below is a reflection. 0 asks for none."""
     min_support_points: Scalar = 2.0
     """And at least this many points."""
+    min_deep_share: Scalar = 1.0
+    """More than .3 m below the plane the ground grid needs, within 3 m, this share of the points that lie at
+    the plane's height; what has less is a mirror image of what stands on a wet road. 0 asks for none."""
     smoothing_m: Scalar = 1.0
     """Standard deviation of the Gaussian that smooths the ground grid (and fills it, 4 x wider)."""
     min_height_m: Scalar = 0.2
@@ -449,3 +452,5 @@ class HealthConfig:
     """So is steeper ground."""
     max_under_share: Scalar = 0.0004
     """So is ground with a larger share of the points right under the origin, steeper than sensors look."""
+    max_below_share: Scalar = 0.1
+    """So is ground with a larger share of the points .3 m or more below it."""

@@ -30,6 +30,8 @@ SUPPORT_LEVELS = 12
 """Two levels are compared with this many from the lower of them up."""
 SENSOR_LEVELS, PLANE_LEVELS = range(-100, 28), range(-13, 11)
 """Levels about the sensor, and about the plane."""
+AT_PLANE_LEVELS = 3
+"""What is within so many levels of the plane lies at its height; what is lower lies deep below it."""
 SHEET_HALF_M, SHEET_REACH, MIN_SHEET_SQUARES = 40.0, 2, 17
 """Sheets are looked for this near, in windows of 5 x 5 squares of which so many are not empty."""
 SHEET_STEP_M, SQUARE_TOLERANCE_M = 0.2, 0.1
@@ -122,7 +124,13 @@ def cell_minima(xyz: np.ndarray, config: GroundConfig) -> np.ndarray:
 
 
 def least_supported(
-    z: np.ndarray, xy: np.ndarray, halves_m: np.ndarray, levels: range, config: GroundConfig
+    z: np.ndarray,
+    xy: np.ndarray,
+    halves_m: np.ndarray,
+    levels: range,
+    config: GroundConfig,
+    *,
+    about_plane: bool = False,
 ) -> np.ndarray:
     """How low a point may be to be ground: where others near by are about as low.
 
@@ -131,7 +139,8 @@ def least_supported(
       xy: (n, 2) m.
       halves_m: (2,) m: the squares cover |x| and |y| below these.
       levels: which levels of .1 m there are; lower and higher points are in the first and the last.
-      config: the least share, and the least number, of the points in 3 x 3 squares.
+      config: the least shares, and the least number, of the points in 3 x 3 squares.
+      about_plane: heights are above the plane; deep below it there have to be as many points as at it.
 
     Returns:
       (n,) m: minus infinity where the lowest level has support, infinity where none has.
@@ -149,7 +158,13 @@ def least_supported(
         return np.lib.stride_tricks.sliding_window_view(padded, num, axis=2).sum(axis=-1)
 
     needed = np.maximum(config.min_support_share * up_to(SUPPORT_LEVELS), config.min_support_points)
-    supported = up_to(2) >= needed
+    pairs = up_to(2)
+    if about_plane:
+        level = np.array(levels)
+        at_plane = pairs[..., (level >= -AT_PLANE_LEVELS) & (level < AT_PLANE_LEVELS - 1)].max(axis=2)
+        deep = level < -AT_PLANE_LEVELS
+        needed[..., deep] = np.maximum(needed[..., deep], config.min_deep_share * at_plane[..., None])
+    supported = pairs >= needed
     least = np.array(levels) / SUPPORT_LEVELS_PER_M
     least[0] = -np.inf
     lowest = np.where(supported.any(axis=2), least[supported.argmax(axis=2)], np.inf)
@@ -307,7 +322,9 @@ def fit_ground_surface(xyz: np.ndarray, planes: np.ndarray, config: GroundConfig
     in_band = (deviation > -(config.band_below_m + config.band_below_grade * rho)) & ~above_band
     # Higher returns can only be of sheets.
     ground = above_band & (deviation < config.band_above_m + config.sheet_band_grade * rho)
-    least = least_supported(deviation[in_band], xy[in_band], np.full(2, half_m), PLANE_LEVELS, config)
+    least = least_supported(
+        deviation[in_band], xy[in_band], np.full(2, half_m), PLANE_LEVELS, config, about_plane=True
+    )
     ground[in_band] = deviation[in_band] >= least
     lowest = np.full((num_cells, num_cells), np.inf)
     np.minimum.at(lowest, tuple(index[ground].T), deviation[ground])

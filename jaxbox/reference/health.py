@@ -39,7 +39,9 @@ def measure_health(
     # NaN, the height of points that do not count, compares False.
     off_ground = np.abs(ground.height)
     near = (rho > NEAR_M) & (rho < FAR_M) & (off_ground < GROUND_BAND_M)
-    near &= ground.surface is not None
+    below = ground.height <= -GROUND_BAND_M
+    if ground.surface is None:
+        near[:], below[:] = False, False
     sensor_height_m = -ground.planes[0, 2]
     under = (off_ground < ground_config.min_height_m) & (rho < UNDER_RATIO * sensor_height_m)
     is_low = MIN_HEIGHT_M <= sensor_height_m < LOW_M
@@ -56,4 +58,5 @@ def measure_health(
         "near_ground_points": int(near.sum()),
         "rough_points": int((near & (off_ground > ROUGH_M)).sum()),
         "points_under": int(under.sum()),
+        "points_below": int(below.sum()),
     }

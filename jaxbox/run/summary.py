@@ -107,16 +107,21 @@ class ReturnsSummary:
     """Share of the ground's points near by that lie off it, in [0, 1]; large where ranges are noisy."""
     points_under: int
     """Ground points right under the origin; many where it is not the sensor's."""
+    below_share: float
+    """Share of the region's points .3 m or more below the ground, in [0, 1]; large where the road is not the
+    ground that was found, and where it mirrors."""
 
     @classmethod
     def of(cls, counts: Counts, config: DetectorConfig) -> "ReturnsSummary":
         """Those of one sweep; shares of nothing are 0."""
         finite = counts.num_points - int(counts.dropped_points) - int(counts.nonfinite_points)
+        in_region = finite - int(counts.out_of_range_points)
         return cls(
             far_share=int(counts.far_points) / max(finite, 1),
             scattered_share=int(counts.scattered_azimuths) / config.evidence.num_azimuths,
             rough_share=int(counts.rough_points) / max(int(counts.near_ground_points), 1),
             points_under=int(counts.points_under),
+            below_share=int(counts.points_below) / max(in_region, 1),
         )
 
 

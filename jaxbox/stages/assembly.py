@@ -203,6 +203,7 @@ def _counts(points: jax.Array, cloud: PointCloud, found: Found, largest_hull: ja
         near_ground_points=health.near_ground_points,
         rough_points=health.rough_points,
         points_under=health.points_under,
+        points_below=health.points_below,
     )
 
 
@@ -240,8 +241,9 @@ def _is_degraded(counts: Counts, in_region: jax.Array, config: DetectorConfig) -
 
 
 def _is_doubtful(plane: GroundPlane, counts: Counts, in_region: jax.Array, limits: HealthConfig) -> jax.Array:
-    """() bool: whether no road lies so under a vehicle's sensor."""
+    """() bool: whether no road lies so under a vehicle's sensor, or much lies below it."""
     a, b, c = plane.coefficients
     steep = jnp.hypot(a, b) > jnp.tan(jnp.deg2rad(limits.max_tilt_deg))
     under = _exceeds(counts.points_under, limits.max_under_share, in_region)
-    return (-c > limits.max_sensor_height_m) | steep | under
+    below = _exceeds(counts.points_below, limits.max_below_share, in_region)
+    return (-c > limits.max_sensor_height_m) | steep | under | below

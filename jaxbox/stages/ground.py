@@ -13,13 +13,13 @@ from jaxbox.config.capacities import obstacle_capacity
 from jaxbox.config.schema import GROUND_CANDIDATE_CELL_M
 from jaxbox.geometry.planar import plane_residual
 from jaxbox.stages._sheets import on_sheets
+from jaxbox.stages._support import PLANE_LEVELS, SENSOR_LEVELS, least_supported
 from jaxbox.stages.state import Ground, Obstacles, Sweep
 from jaxbox.types import GroundPlane
 from jaxbox.xla import chunks
 from jaxbox.xla.barriers import store
-from jaxbox.xla.grids import margin_cells, window_counts
 from jaxbox.xla.hashing import hashed_uniform
-from jaxbox.xla.indexing import lookup, lookup_corners, take
+from jaxbox.xla.indexing import lookup_corners, take
 from jaxbox.xla.least_squares import refit_plane
 from jaxbox.xla.loops import apply_in_turn, map_batches, repeat
 from jaxbox.xla.rows import compact, count_true, maximum
@@ -44,18 +44,6 @@ WIDE_POOL_CELLS = 8
 
 GAUSSIAN_TRUNCATION = 3.0
 """Gaussians reach that many standard deviations, as in scipy.ndimage.gaussian_filter(truncate=3)."""
-
-
-SUPPORT_SQUARE_M = 2.0
-"""Edge of the squares in which points support each other as ground."""
-
-
-SUPPORT_LEVELS_PER_M, SUPPORT_LEVELS = 10.0, 12
-"""Heights are compared in levels of .1 m, and a level with so many from it on."""
-
-
-SENSOR_LEVELS, PLANE_LEVELS = range(-100, 28), range(-13, 11)
-"""Levels about the sensor, in which the ground is sought, and about the plane."""
 
 
 def remove_ground(sweep: Sweep, config: GroundConfig, key: jax.Array) -> Ground:
@@ -170,54 +158,6 @@ def cell_minima(xyz: jax.Array, mask: jax.Array, config: GroundConfig) -> tuple[
     y = (j + 0.5) * GROUND_CANDIDATE_CELL_M - half_y_m
     candidates = jnp.stack([x, y, jnp.where(occupied, lowest, 0)], axis=1)
     return candidates, occupied
-
-
-def least_supported(
-    z: jax.Array,
-    xy: jax.Array,
-    mask: jax.Array,
-    halves_m: tuple[float, float],
-    levels: range,
-    config: GroundConfig,
-) -> jax.Array:
-    """How low a point may be to be ground: where others near by are about as low.
-
-    Returns from below the road (a beam that a puddle or glass reflects goes on past the road) are few and
-    spread in height, the road's are many and close together. In each square with the eight round it, the
-    lowest level is sought that holds, together with the next, enough of the points up to 1.2 m above it.
-
-    Args:
-      z: (N,) float32, m.
-      xy: (N, 2) float32, m.
-      mask: (N,) bool, points that count.
-      halves_m: the squares cover |x| and |y| below these.
-      levels: which levels there are; lower and higher points are in the first and the last.
-      config: the least share of those points, and their least number.
-
-    Returns:
-      (N,) float32, m: minus infinity where the lowest level has support, infinity where none has.
-
-    Reference: oracle `jaxbox.reference.least_supported`.
-    """
-    num_levels = len(levels)
-    shape = math.ceil(2 * halves_m[0] / SUPPORT_SQUARE_M), math.ceil(2 * halves_m[1] / SUPPORT_SQUARE_M)
-    row, column = (
-        jnp.clip(jnp.floor((xy[:, a] + halves_m[a]) / SUPPORT_SQUARE_M).astype(jnp.int32), 0, shape[a] - 1)
-        for a in (0, 1)
-    )
-    square = margin_cells(row, column, shape)
-    level = jnp.floor(z * SUPPORT_LEVELS_PER_M).astype(jnp.int32) - levels.start
-    level = jnp.clip(level, 0, num_levels - 1)
-    count = window_counts(
-        level, square, mask, num_levels=num_levels, num_above=SUPPORT_LEVELS - 1, shape=shape
-    )
-    two = count[:-1] + count[1:]
-    four = two[:-2] + two[2:]
-    twelve = four[:-8] + four[4:-4] + four[8:]
-    supported = two[:num_levels] >= jnp.maximum(config.min_support_share * twelve, config.min_support_points)
-    least = np.array(levels, np.float32) / np.float32(SUPPORT_LEVELS_PER_M)
-    least[0] = -np.inf
-    return lookup(jnp.min(jnp.where(supported, least[:, None], jnp.inf), axis=0), square)
 
 
 def spread_points(
@@ -371,7 +311,10 @@ def fit_ground_surface(xyz: jax.Array, mask: jax.Array, planes: jax.Array, confi
     i, j = (jnp.floor((xyz[:, axis] + half_m) / cell_m).astype(jnp.int32) for axis in (0, 1))
     inside = (i >= 0) & (i < n) & (j >= 0) & (j < n)
     counted = mask & inside & (rho > config.blind_radius_m)
-    least = least_supported(height, xyz[:, :2], counted & in_band, (half_m, half_m), PLANE_LEVELS, config)
+    halves_m = half_m, half_m
+    least = least_supported(
+        height, xyz[:, :2], counted & in_band, halves_m, PLANE_LEVELS, config, about_plane=True
+    )
     may_be_sheet = above_band & (height < config.band_above_m + config.sheet_band_grade * rho)
     may_be_ground = counted & ((in_band & (height >= least)) | may_be_sheet)
     lowest = segment_minima(height, i * n + j, may_be_ground, num_segments=n * n).reshape(n, n)

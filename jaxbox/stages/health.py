@@ -33,6 +33,7 @@ def measure_health(
 
     Fog and rain take the far points; drops, flakes and dust return from the air near the sensor, where other
     beams pass; noise blurs the ground. Where the origin is not the sensor's, there is ground right under it.
+    Where the road is not the ground that was found, or mirrors, much lies below the ground.
 
     Args:
       sweep: of N rows.
@@ -57,8 +58,9 @@ def measure_health(
     under &= rho < UNDER_RATIO * sensor_height_m
     share = jnp.where(sensor_height_m < MIN_HEIGHT_M, 1, jnp.minimum(sensor_height_m / LOW_M, 1))
     far = sweep.finite & (~sweep.in_region | (rho > config.far_m * share))
-    far, near, rough, under = count_each(far, near, near & (off_ground > ROUGH_M), under)
-    return Health(far, _scattered_azimuths(evidence), near, rough, under)
+    below = sweep.inlier & (ground.height <= -GROUND_BAND_M) & follows_road
+    far, near, rough, under, below = count_each(far, near, near & (off_ground > ROUGH_M), under, below)
+    return Health(far, _scattered_azimuths(evidence), near, rough, under, below)
 
 
 def _scattered_azimuths(evidence: Evidence | None) -> jax.Array:

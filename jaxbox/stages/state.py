@@ -71,6 +71,8 @@ class Health:
     """() int32."""
     points_under: jax.Array
     """() int32."""
+    points_below: jax.Array
+    """() int32."""
 
 
 @jax.tree_util.register_dataclass
