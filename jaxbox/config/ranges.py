@@ -69,8 +69,7 @@ _POSITIVE = """
 """Divisors, and what leaves nothing to find at zero. Zero for a map's greatest height turns the map off."""
 
 _SHARES = """
-    ground.min_inlier_fraction ground.min_support_share ground.min_deep_share
-    box.direction_max_free box.min_slab_share
+    ground.min_inlier_fraction ground.min_support_share box.direction_max_free box.min_slab_share
     completion.seen_weight
     health.min_far_share health.max_scattered_share health.max_rough_share health.max_under_share
     health.max_below_share
