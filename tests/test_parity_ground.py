@@ -22,7 +22,8 @@ fit_ground_plane = parity.PerForm(ground.fit_ground_plane)
 fit_ground_surface = jax.jit(ground.fit_ground_surface)
 on_sheets = jax.jit(_sheets.on_sheets)
 planes_through_windows = jax.jit(_sheets.planes_through_windows)
-least_supported = jax.jit(_support.least_supported, static_argnums=(3, 4), static_argnames="about_plane")
+least_supported = jax.jit(_support.least_supported, static_argnums=(3, 4))
+levels_with_area = jax.jit(_support.levels_with_area, static_argnums=1)
 height_above_ground = jax.jit(ground.height_above_ground)
 
 
@@ -52,24 +53,35 @@ def test_cell_minima_are_those_of_the_reference(cases):
         parity.assert_share(differ.sum(), len(differ), 2e-3, "cell minima")
 
 
-@pytest.mark.parametrize("about_plane", [False, True], ids=["sensor", "plane"])
+@pytest.mark.parametrize("levels", [_support.SENSOR_LEVELS, _support.PLANE_LEVELS], ids=["sensor", "plane"])
 @pytest.mark.parametrize("changes", [{}, {"min_support_share": 0.25, "min_support_points": 9.0}])
-def test_ground_has_the_support_that_the_reference_asks_for(cases, changes, about_plane):
+def test_ground_has_the_support_that_the_reference_asks_for(cases, changes, levels):
     config, halves_m = dataclasses.replace(GROUND, **changes), np.array([40.0, 20.0])
-    levels = _support.PLANE_LEVELS if about_plane else _support.SENSOR_LEVELS
     for case in cases:
         xyz = case.xyz[(np.abs(case.xyz[:, :2]) < halves_m).all(axis=1)]
-        # As if the plane were .5 m above the road.
-        xyz = xyz + np.float32([0, 0, about_plane * (SENSOR_HEIGHT_M - 0.5)])
-        expected = reference.least_supported(
-            xyz[:, 2], xyz[:, :2], halves_m, levels, config, about_plane=about_plane
-        )
+        expected = reference.least_supported(xyz[:, 2], xyz[:, :2], halves_m, levels, config)
         padded, mask = parity.pad(xyz, parity.CAPACITY), parity.padded_mask(len(xyz), parity.CAPACITY)
-        least = least_supported(
-            padded[:, 2], padded[:, :2], mask, tuple(halves_m), levels, config, about_plane=about_plane
-        )
+        least = least_supported(padded[:, 2], padded[:, :2], mask, tuple(halves_m), levels, config)
         assert np.unique(expected).size > 3
         np.testing.assert_allclose(np.asarray(least)[: len(xyz)], expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("share", [1.0, 3.0])
+def test_levels_deep_below_the_plane_have_the_area_that_the_reference_asks_for(cases, share):
+    config = dataclasses.replace(GROUND, min_deep_share=share)
+    num_squares, refused = 80, 0
+    for case in cases:
+        lowest = np.full((320, 320), np.inf, np.float32)
+        cell = np.floor((case.xyz[:, :2] + 80) / 0.5).astype(int).clip(0, 319)
+        # As if the plane lay .5 m above the road.
+        np.minimum.at(lowest, tuple(cell.T), case.height - np.float32(0.5))
+        expected = reference.levels_with_area(lowest, 80.0, config)
+        levels = np.asarray(levels_with_area(lowest, 80.0, config))
+        levels = levels.reshape(-1, num_squares + 1, num_squares + 1)[:, :num_squares, :num_squares]
+        # A height on the border of a level may round into either.
+        parity.assert_share(np.sum(np.moveaxis(levels, 0, 2) != expected), expected.size, 1e-4, "levels")
+        refused += np.sum(~expected)
+    assert refused > 1000 * len(cases)
 
 
 def test_few_returns_below_the_road_do_not_move_the_ground():
@@ -93,7 +105,7 @@ def test_mirror_images_in_a_wet_road_do_not_move_the_ground_below_cars():
     sweep = synthetic.make_sweep(5, num_azimuths=1000)
     far = np.hypot(*sweep.xyz[:, :2].T) > 3
     plane = np.array([[0, 0, -SENSOR_HEIGHT_M]], np.float32)
-    xyz, _ = mirror_in_road(sweep.xyz, sweep.intensity, 0.06, np.random.default_rng(0))
+    xyz, _ = mirror_in_road(sweep.xyz, sweep.intensity, 0.03, np.random.default_rng(0))
     error_m = {}
     for share in (0.0, GROUND.min_deep_share):
         config = dataclasses.replace(GROUND, min_deep_share=share)

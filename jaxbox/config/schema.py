@@ -126,8 +126,8 @@ class GroundConfig:
     min_support_points: Scalar = 2.0
     """And at least this many points."""
     min_deep_share: Scalar = 1.0
-    """More than .3 m below the plane the ground grid needs, within 3 m, this share of the points that lie at
-    the plane's height; what has less is a mirror image of what stands on a wet road. 0 asks for none."""
+    """More than .3 m below the plane the ground grid needs, within 3 m, this many cells for each whose lowest
+    point is at the plane; what has fewer is a mirror image of what stands on a wet road. 0 asks for none."""
     smoothing_m: Scalar = 1.0
     """Standard deviation of the Gaussian that smooths the ground grid (and fills it, 4 x wider)."""
     min_height_m: Scalar = 0.2

@@ -129,8 +129,7 @@ def least_supported(
     halves_m: np.ndarray,
     levels: range,
     config: GroundConfig,
-    *,
-    about_plane: bool = False,
+    may_be_ground: np.ndarray | None = None,
 ) -> np.ndarray:
     """How low a point may be to be ground: where others near by are about as low.
 
@@ -139,8 +138,8 @@ def least_supported(
       xy: (n, 2) m.
       halves_m: (2,) m: the squares cover |x| and |y| below these.
       levels: which levels of .1 m there are; lower and higher points are in the first and the last.
-      config: the least shares, and the least number, of the points in 3 x 3 squares.
-      about_plane: heights are above the plane; deep below it there have to be as many points as at it.
+      config: the least share, and the least number, of the points in 3 x 3 squares.
+      may_be_ground: (rows, columns, levels) bool; None for all.
 
     Returns:
       (n,) m: minus infinity where the lowest level has support, infinity where none has.
@@ -158,17 +157,40 @@ def least_supported(
         return np.lib.stride_tricks.sliding_window_view(padded, num, axis=2).sum(axis=-1)
 
     needed = np.maximum(config.min_support_share * up_to(SUPPORT_LEVELS), config.min_support_points)
-    pairs = up_to(2)
-    if about_plane:
-        level = np.array(levels)
-        at_plane = pairs[..., (level >= -AT_PLANE_LEVELS) & (level < AT_PLANE_LEVELS - 1)].max(axis=2)
-        deep = level < -AT_PLANE_LEVELS
-        needed[..., deep] = np.maximum(needed[..., deep], config.min_deep_share * at_plane[..., None])
-    supported = pairs >= needed
+    supported = up_to(2) >= needed
+    if may_be_ground is not None:
+        supported &= may_be_ground
     least = np.array(levels) / SUPPORT_LEVELS_PER_M
     least[0] = -np.inf
     lowest = np.where(supported.any(axis=2), least[supported.argmax(axis=2)], np.inf)
     return lowest[tuple(square.T)]
+
+
+def levels_with_area(lowest: np.ndarray, half_m: float, config: GroundConfig) -> np.ndarray:
+    """Which levels about the plane may be ground: deep ones that are lowest in enough cells.
+
+    Args:
+      lowest: (n, n) m above the plane, infinite where a cell is empty.
+      half_m: the cells cover |x| and |y| below this.
+      config: `min_deep_share` cells deep below the plane are asked for each cell at the plane.
+
+    Returns:
+      (rows, columns, levels) bool, of 3 x 3 squares.
+    """
+    num_squares = int(np.ceil(2 * half_m / SUPPORT_SQUARE_M))
+    row, column = np.nonzero(np.isfinite(lowest))
+    cell_m = 2 * half_m / len(lowest)
+    square = np.floor((np.stack([row, column]) + 0.5) * cell_m / SUPPORT_SQUARE_M).astype(int)
+    level = np.floor(lowest[row, column] * SUPPORT_LEVELS_PER_M).astype(int)
+    level = level.clip(PLANE_LEVELS.start, PLANE_LEVELS.stop - 1) - PLANE_LEVELS.start
+    count = np.zeros((num_squares, num_squares, len(PLANE_LEVELS) + 1))
+    np.add.at(count, (*square, level), 1)
+    count = ndimage.convolve(count, np.ones((3, 3, 1)), mode="constant")
+    pairs = count[..., :-1] + count[..., 1:]
+    levels = np.array(PLANE_LEVELS)
+    is_at_plane = (levels >= -AT_PLANE_LEVELS) & (levels < AT_PLANE_LEVELS - 1)
+    needed = config.min_deep_share * pairs[..., is_at_plane].max(axis=2, keepdims=True)
+    return (levels >= -AT_PLANE_LEVELS) | (pairs >= needed)
 
 
 def spread_points(xyz: np.ndarray, inlier: np.ndarray, config: GroundConfig) -> np.ndarray:
@@ -322,9 +344,10 @@ def fit_ground_surface(xyz: np.ndarray, planes: np.ndarray, config: GroundConfig
     in_band = (deviation > -(config.band_below_m + config.band_below_grade * rho)) & ~above_band
     # Higher returns can only be of sheets.
     ground = above_band & (deviation < config.band_above_m + config.sheet_band_grade * rho)
-    least = least_supported(
-        deviation[in_band], xy[in_band], np.full(2, half_m), PLANE_LEVELS, config, about_plane=True
-    )
+    lowest = np.full((num_cells, num_cells), np.inf)
+    np.minimum.at(lowest, tuple(index[in_band].T), deviation[in_band])
+    levels = levels_with_area(lowest, half_m, config)
+    least = least_supported(deviation[in_band], xy[in_band], np.full(2, half_m), PLANE_LEVELS, config, levels)
     ground[in_band] = deviation[in_band] >= least
     lowest = np.full((num_cells, num_cells), np.inf)
     np.minimum.at(lowest, tuple(index[ground].T), deviation[ground])

@@ -33,15 +33,13 @@ def least_supported(
     halves_m: tuple[float, float],
     levels: range,
     config: GroundConfig,
-    *,
-    about_plane: bool = False,
+    may_be_ground: jax.Array | None = None,
 ) -> jax.Array:
     """How low a point may be to be ground: where others near by are about as low.
 
     Returns from below the road (a beam that a puddle or glass reflects goes on past the road) are few and
     spread in height, the road's are many and close together. In each square with the eight round it, the
-    lowest level is sought that holds, together with the next, enough of the points up to 1.2 m above it, and
-    deep below the plane enough for those at the plane: below far cars their mirror images outnumber the road.
+    lowest level is sought that holds, together with the next, enough of the points up to 1.2 m above it.
 
     Args:
       z: (N,) float32, m.
@@ -49,8 +47,8 @@ def least_supported(
       mask: (N,) bool, points that count.
       halves_m: the squares cover |x| and |y| below these.
       levels: which levels there are; lower and higher points are in the first and the last.
-      config: the least shares of those points, and their least number.
-      about_plane: heights are above the plane.
+      config: the least share of those points, and their least number.
+      may_be_ground: (L, cells) bool, see `levels_with_area`; None for all.
 
     Returns:
       (N,) float32, m: minus infinity where the lowest level has support, infinity where none has.
@@ -58,7 +56,7 @@ def least_supported(
     Reference: oracle `jaxbox.reference.least_supported`.
     """
     num_levels = len(levels)
-    shape = math.ceil(2 * halves_m[0] / SUPPORT_SQUARE_M), math.ceil(2 * halves_m[1] / SUPPORT_SQUARE_M)
+    shape = _num_squares(halves_m[0]), _num_squares(halves_m[1])
     row, column = (
         jnp.clip(jnp.floor((xy[:, a] + halves_m[a]) / SUPPORT_SQUARE_M).astype(jnp.int32), 0, shape[a] - 1)
         for a in (0, 1)
@@ -72,13 +70,54 @@ def least_supported(
     two = count[:-1] + count[1:]
     four = two[:-2] + two[2:]
     twelve = four[:-8] + four[4:-4] + four[8:]
-    needed = jnp.maximum(config.min_support_share * twelve, config.min_support_points)
-    if about_plane:
-        plane_row = -levels.start
-        at_plane = jnp.max(two[plane_row - AT_PLANE_LEVELS : plane_row + AT_PLANE_LEVELS - 1], axis=0)
-        is_deep = np.array(levels)[:, None] < -AT_PLANE_LEVELS
-        needed = jnp.maximum(needed, jnp.where(is_deep, config.min_deep_share * at_plane, 0))
-    supported = two[:num_levels] >= needed
+    supported = two[:num_levels] >= jnp.maximum(config.min_support_share * twelve, config.min_support_points)
+    if may_be_ground is not None:
+        supported &= may_be_ground
     least = np.array(levels, np.float32) / np.float32(SUPPORT_LEVELS_PER_M)
     least[0] = -np.inf
     return lookup(jnp.min(jnp.where(supported, least[:, None], jnp.inf), axis=0), square)
+
+
+def levels_with_area(lowest: jax.Array, half_m: float, config: GroundConfig) -> jax.Array:
+    """Which levels about the plane may be ground, by how many cells have their lowest point there.
+
+    Mirror images in a wet road lie as deep below it as things stand above. Below far cars they are more than
+    the few returns of the road, but under the cars alone, and at all depths. So what lies deep below the
+    plane has to be lowest in as many cells as what lies at the plane. Where the ground is lower than the
+    plane, things on it reach the plane's height, but are lowest in few cells there.
+
+    Args:
+      lowest: (n, n) float32, m above the plane: the lowest point of each cell, infinite where it is empty.
+      half_m: the cells cover |x| and |y| below this.
+      config: the share of cells.
+
+    Returns:
+      (L, cells) bool for `PLANE_LEVELS`, see `margin_cells`; of cells of the margin anything.
+
+    Reference: oracle `jaxbox.reference.levels_with_area`.
+    """
+    n, num_levels, plane_row = lowest.shape[0], len(PLANE_LEVELS), -PLANE_LEVELS.start
+    shape = _num_squares(half_m), _num_squares(half_m)
+    middle_m = (np.arange(n) + 0.5) * (2 * half_m / n)
+    of_line = np.floor(middle_m / SUPPORT_SQUARE_M).astype(np.int32)
+    row, column = map(jnp.array, np.meshgrid(of_line, of_line, indexing="ij"))
+    square = margin_cells(row, column, shape)
+    is_occupied = jnp.isfinite(lowest)
+    level = jnp.floor(jnp.where(is_occupied, lowest, 0) * SUPPORT_LEVELS_PER_M).astype(jnp.int32) + plane_row
+    level = jnp.clip(level, 0, num_levels - 1)
+    count = window_counts(
+        level.reshape(-1),
+        square.reshape(-1),
+        is_occupied.reshape(-1),
+        num_levels=num_levels,
+        num_above=1,
+        shape=shape,
+    )
+    two = count[:-1] + count[1:]
+    near = two[plane_row - AT_PLANE_LEVELS : plane_row + AT_PLANE_LEVELS - 1]
+    is_at_plane_or_above = jnp.array(PLANE_LEVELS)[:, None] >= -AT_PLANE_LEVELS
+    return is_at_plane_or_above | (two >= config.min_deep_share * jnp.max(near, axis=0, keepdims=True))
+
+
+def _num_squares(half_m: float) -> int:
+    return math.ceil(2 * half_m / SUPPORT_SQUARE_M)

@@ -13,7 +13,7 @@ from jaxbox.config.capacities import obstacle_capacity
 from jaxbox.config.schema import GROUND_CANDIDATE_CELL_M
 from jaxbox.geometry.planar import plane_residual
 from jaxbox.stages._sheets import on_sheets
-from jaxbox.stages._support import PLANE_LEVELS, SENSOR_LEVELS, least_supported
+from jaxbox.stages._support import PLANE_LEVELS, SENSOR_LEVELS, least_supported, levels_with_area
 from jaxbox.stages.state import Ground, Obstacles, Sweep
 from jaxbox.types import GroundPlane
 from jaxbox.xla import chunks
@@ -311,10 +311,10 @@ def fit_ground_surface(xyz: jax.Array, mask: jax.Array, planes: jax.Array, confi
     i, j = (jnp.floor((xyz[:, axis] + half_m) / cell_m).astype(jnp.int32) for axis in (0, 1))
     inside = (i >= 0) & (i < n) & (j >= 0) & (j < n)
     counted = mask & inside & (rho > config.blind_radius_m)
-    halves_m = half_m, half_m
-    least = least_supported(
-        height, xyz[:, :2], counted & in_band, halves_m, PLANE_LEVELS, config, about_plane=True
-    )
+    of_band = counted & in_band
+    lowest = segment_minima(height, i * n + j, of_band, num_segments=n * n).reshape(n, n)
+    levels = levels_with_area(lowest, half_m, config)
+    least = least_supported(height, xyz[:, :2], of_band, (half_m, half_m), PLANE_LEVELS, config, levels)
     may_be_sheet = above_band & (height < config.band_above_m + config.sheet_band_grade * rho)
     may_be_ground = counted & ((in_band & (height >= least)) | may_be_sheet)
     lowest = segment_minima(height, i * n + j, may_be_ground, num_segments=n * n).reshape(n, n)
