@@ -105,13 +105,13 @@ def test_mirror_images_in_a_wet_road_do_not_move_the_ground_below_cars():
     sweep = synthetic.make_sweep(5, num_azimuths=1000)
     far = np.hypot(*sweep.xyz[:, :2].T) > 3
     plane = np.array([[0, 0, -SENSOR_HEIGHT_M]], np.float32)
-    xyz, _ = mirror_in_road(sweep.xyz, sweep.intensity, 0.03, np.random.default_rng(0))
+    xyz, _ = mirror_in_road(sweep.xyz, sweep.intensity, 0.06, np.random.default_rng(0))
     error_m = {}
     for share in (0.0, GROUND.min_deep_share):
         config = dataclasses.replace(GROUND, min_deep_share=share)
         surface = fit_ground_surface(xyz, far, plane, config)
         error_m[share] = np.abs(ground.surface_height(surface, sweep.boxes.center[:, :2], config)).max()
-    assert error_m[GROUND.min_deep_share] < 0.03 < 0.5 < error_m[0.0], error_m
+    assert error_m[GROUND.min_deep_share] < 0.08 < 0.5 < error_m[0.0], error_m
 
 
 @pytest.mark.usefixtures("platform")
