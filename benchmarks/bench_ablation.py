@@ -65,7 +65,7 @@ ABLATIONS = (
     Ablation("one plane instead of the ground grid", {"ground.surface": False, **MORE_POINTS}),
     Ablation("ground grid of grade 0.2", {"ground.max_grade": 0.2}),
     Ablation("ground needs no support", {"ground.min_support_share": 0.0}),
-    Ablation("mirror images may be ground", {"ground.min_deep_share": 0.0}),
+    Ablation("mirror images may be ground", {"ground.min_deep_ratio": 0.0}),
     Ablation("smooth sheets are no ground", {"ground.sheet_tolerance_m": 0.0}),
     # Proposals.
     Ablation("one map: 0.2 m", _without_maps(1, 2)),

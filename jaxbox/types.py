@@ -85,7 +85,7 @@ _STATUS_TEXT = {
     Status.DOUBTFUL_GROUND: "the ground lies farther below the origin, or steeper, than a road lies under a "
     "vehicle's sensor, or right under it where no sensor looks, or many points lie below it. The points are "
     "not in metres, the sensor is tilted, or it is not at the origin: scale, turn or move them first; or the "
-    "road lies on two levels, or is covered with water, and vehicles may be missing.",
+    "road lies on two levels, and vehicles may be missing.",
 } | {bit: "; or ".join(row.overflow for row in rows) + "." for bit, rows in _OVERFLOW_ROWS.items()}
 
 

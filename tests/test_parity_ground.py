@@ -68,8 +68,8 @@ def test_ground_has_the_support_that_the_reference_asks_for(cases, changes, leve
 
 @pytest.mark.parametrize("share", [1.0, 3.0])
 def test_levels_deep_below_the_plane_have_the_area_that_the_reference_asks_for(cases, share):
-    config = dataclasses.replace(GROUND, min_deep_share=share)
-    num_squares, refused = 80, 0
+    config = dataclasses.replace(GROUND, min_deep_ratio=share)
+    num_squares, of_road, of_strays = 80, [], []
     for case in cases:
         lowest = np.full((320, 320), np.inf, np.float32)
         cell = np.floor((case.xyz[:, :2] + 80) / 0.5).astype(int).clip(0, 319)
@@ -80,21 +80,26 @@ def test_levels_deep_below_the_plane_have_the_area_that_the_reference_asks_for(c
         levels = levels.reshape(-1, num_squares + 1, num_squares + 1)[:, :num_squares, :num_squares]
         # A height on the border of a level may round into either.
         parity.assert_share(np.sum(np.moveaxis(levels, 0, 2) != expected), expected.size, 1e-4, "levels")
-        refused += np.sum(~expected)
-    assert refused > 1000 * len(cases)
+        row, column = np.nonzero(np.isfinite(lowest))
+        level = np.floor(10 * lowest[row, column]).astype(int).clip(-13, 10)
+        may_be_ground = expected[row // 4, column // 4, level + 13]
+        of_road.append(may_be_ground[(level == -6) | (level == -5)])
+        of_strays.append(may_be_ground[level < -8])
+    assert np.mean(np.concatenate(of_road)) > 0.9
+    assert np.mean(np.concatenate(of_strays)) < 0.95
 
 
 def test_few_returns_below_the_road_do_not_move_the_ground():
     sweep = synthetic.make_sweep(5, num_azimuths=1000)
-    config = GROUND
+    # Support alone: that deep levels are lowest in few cells would do, too.
+    config = dataclasses.replace(GROUND, min_deep_ratio=0.0)
     far = np.hypot(*sweep.xyz[:, :2].T) > 3
     mask, plane = far, np.array([[0, 0, -SENSOR_HEIGHT_M]], np.float32)
     xyz, _ = reflect_below_road(sweep.xyz, sweep.intensity, 0.01, np.random.default_rng(0))
     square = np.abs(np.mgrid[-79.5:80, -79.5:80]).max(axis=0) < 20
     surfaces = {}
     for share in (0.0, config.min_support_share):
-        asked = {"min_support_share": share, "min_support_points": 40 * share, "min_deep_share": 20 * share}
-        some = dataclasses.replace(config, **asked)
+        some = dataclasses.replace(config, min_support_share=share, min_support_points=40 * share)
         surfaces[share] = np.asarray(fit_ground_surface(xyz, mask, plane, some))[square]
     clean = np.asarray(fit_ground_surface(sweep.xyz, mask, plane, config))[square]
     errors = {share: np.abs(surface - clean).mean() for share, surface in surfaces.items()}
@@ -107,11 +112,24 @@ def test_mirror_images_in_a_wet_road_do_not_move_the_ground_below_cars():
     plane = np.array([[0, 0, -SENSOR_HEIGHT_M]], np.float32)
     xyz, _ = mirror_in_road(sweep.xyz, sweep.intensity, 0.06, np.random.default_rng(0))
     error_m = {}
-    for share in (0.0, GROUND.min_deep_share):
-        config = dataclasses.replace(GROUND, min_deep_share=share)
+    for share in (0.0, GROUND.min_deep_ratio):
+        config = dataclasses.replace(GROUND, min_deep_ratio=share)
         surface = fit_ground_surface(xyz, far, plane, config)
         error_m[share] = np.abs(ground.surface_height(surface, sweep.boxes.center[:, :2], config)).max()
-    assert error_m[GROUND.min_deep_share] < 0.08 < 0.5 < error_m[0.0], error_m
+    assert error_m[GROUND.min_deep_ratio] < 0.08 < 0.5 < error_m[0.0], error_m
+
+
+@pytest.mark.parametrize("seed", [5, 6])
+def test_a_road_deep_below_the_plane_is_ground_all_the_same(seed):
+    sweep = synthetic.make_sweep(seed, num_azimuths=1000)
+    rho = np.hypot(*sweep.xyz[:, :2].T)
+    plane = np.array([[0, 0, 0.45 - SENSOR_HEIGHT_M]], np.float32)
+    surface = fit_ground_surface(sweep.xyz, rho > 3, plane, GROUND)
+    center = sweep.boxes.center[:, :2]
+    # Nearer than 8 m a road so deep is none of this plane's; where it is seldom seen it is filled in.
+    center = center[(np.hypot(*center.T) > 10) & (np.hypot(*center.T) < 30)]
+    height = np.asarray(ground.surface_height(surface, center, GROUND))
+    parity.assert_within(height + 0.45, 0.05, "m between the road and the ground below cars")
 
 
 @pytest.mark.usefixtures("platform")

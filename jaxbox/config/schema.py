@@ -125,9 +125,10 @@ class GroundConfig:
     (.1 to .2 m); what lies below is a reflection. 0 asks for none."""
     min_support_points: Scalar = 2.0
     """And at least this many points."""
-    min_deep_share: Scalar = 1.0
-    """More than .3 m below the plane the ground grid needs, within 3 m, this many cells for each whose lowest
-    point is at the plane; what has fewer is a mirror image of what stands on a wet road. 0 asks for none."""
+    min_deep_ratio: Scalar = 1.0
+    """Of heights more than .3 m below the plane .2 m are ground only where they hold the lowest point of so
+    many cells within 3 m for each cell in the fullest .2 m at the plane; what has fewer is a mirror image in
+    a wet road. 0 asks for none."""
     smoothing_m: Scalar = 1.0
     """Standard deviation of the Gaussian that smooths the ground grid (and fills it, 4 x wider)."""
     min_height_m: Scalar = 0.2

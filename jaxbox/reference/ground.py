@@ -172,7 +172,8 @@ def levels_with_area(lowest: np.ndarray, half_m: float, config: GroundConfig) ->
     Args:
       lowest: (n, n) m above the plane, infinite where a cell is empty.
       half_m: the cells cover |x| and |y| below this.
-      config: `min_deep_share` cells deep below the plane are asked for each cell at the plane.
+      config: in two levels deep below the plane `min_deep_ratio` cells are asked for each cell in the fullest
+        two at the plane.
 
     Returns:
       (rows, columns, levels) bool, of 3 x 3 squares.
@@ -189,7 +190,7 @@ def levels_with_area(lowest: np.ndarray, half_m: float, config: GroundConfig) ->
     pairs = count[..., :-1] + count[..., 1:]
     levels = np.array(PLANE_LEVELS)
     is_at_plane = (levels >= -AT_PLANE_LEVELS) & (levels < AT_PLANE_LEVELS - 1)
-    needed = config.min_deep_share * pairs[..., is_at_plane].max(axis=2, keepdims=True)
+    needed = config.min_deep_ratio * pairs[..., is_at_plane].max(axis=2, keepdims=True)
     return (levels >= -AT_PLANE_LEVELS) | (pairs >= needed)
 
 

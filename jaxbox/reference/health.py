@@ -10,7 +10,7 @@ NEAR_CELLS = 16
 NEAR_M, FAR_M = 3.0, 12.0
 """Between these ranges the ground is compared with its surface."""
 GROUND_BAND_M = 0.3
-"""Points at most so far from the ground are compared,"""
+"""Points nearer to the ground are compared, lower ones are below it,"""
 ROUGH_M = 0.05
 """and are rough where they are farther than this."""
 LOW_M, MIN_HEIGHT_M = 0.8, 0.2

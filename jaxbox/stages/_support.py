@@ -83,8 +83,9 @@ def levels_with_area(lowest: jax.Array, half_m: float, config: GroundConfig) -> 
 
     Mirror images in a wet road lie as deep below it as things stand above. Below far cars they are more than
     the few returns of the road, but under the cars alone, and at all depths. So what lies deep below the
-    plane has to be lowest in as many cells as what lies at the plane. Where the ground is lower than the
-    plane, things on it reach the plane's height, but are lowest in few cells there.
+    plane has to be lowest in as many cells as what lies at the plane, .2 m of heights against the fullest
+    .2 m. Where the ground is lower than the plane, things on it reach the plane's height, but are lowest in
+    few cells there.
 
     Args:
       lowest: (n, n) float32, m above the plane: the lowest point of each cell, infinite where it is empty.
@@ -99,9 +100,8 @@ def levels_with_area(lowest: jax.Array, half_m: float, config: GroundConfig) -> 
     n, num_levels, plane_row = lowest.shape[0], len(PLANE_LEVELS), -PLANE_LEVELS.start
     shape = _num_squares(half_m), _num_squares(half_m)
     middle_m = (np.arange(n) + 0.5) * (2 * half_m / n)
-    of_line = np.floor(middle_m / SUPPORT_SQUARE_M).astype(np.int32)
-    row, column = map(jnp.array, np.meshgrid(of_line, of_line, indexing="ij"))
-    square = margin_cells(row, column, shape)
+    line = jnp.array(np.floor(middle_m / SUPPORT_SQUARE_M), jnp.int32)
+    square = margin_cells(line[:, None], line[None], shape)
     is_occupied = jnp.isfinite(lowest)
     level = jnp.floor(jnp.where(is_occupied, lowest, 0) * SUPPORT_LEVELS_PER_M).astype(jnp.int32) + plane_row
     level = jnp.clip(level, 0, num_levels - 1)
@@ -116,7 +116,7 @@ def levels_with_area(lowest: jax.Array, half_m: float, config: GroundConfig) -> 
     two = count[:-1] + count[1:]
     near = two[plane_row - AT_PLANE_LEVELS : plane_row + AT_PLANE_LEVELS - 1]
     is_at_plane_or_above = np.array(PLANE_LEVELS)[:, None] >= -AT_PLANE_LEVELS
-    return is_at_plane_or_above | (two >= config.min_deep_share * jnp.max(near, axis=0, keepdims=True))
+    return is_at_plane_or_above | (two >= config.min_deep_ratio * jnp.max(near, axis=0, keepdims=True))
 
 
 def _num_squares(half_m: float) -> int:

@@ -245,6 +245,6 @@ def _is_doubtful(plane: GroundPlane, counts: Counts, in_region: jax.Array, limit
     a, b, c = plane.coefficients
     steep = jnp.hypot(a, b) > jnp.tan(jnp.deg2rad(limits.max_tilt_deg))
     under = _exceeds(counts.points_under, limits.max_under_share, in_region)
-    # All hangs from ground above the sensor, which has a bit of its own.
+    # Under ground above the sensor lies every point; GROUND_ABOVE says that already.
     below = _exceeds(counts.points_below, limits.max_below_share, in_region) & (c <= GROUND_ABOVE_M)
     return (-c > limits.max_sensor_height_m) | steep | under | below

@@ -16,7 +16,8 @@ NEAR_M = (3.0, 12.0)
 """Ranges at which the ground is compared with its surface: noise blurs it there, slopes hardly do."""
 
 GROUND_BAND_M, ROUGH_M = 0.3, 0.05
-"""What is nearer to the ground than the first counts, and is rough beyond the second; roads are flatter."""
+"""What is nearer to the ground than the first is compared with it, and is rough beyond the second, as roads
+are flatter; what lies lower than the first is below the ground."""
 
 LOW_M, MIN_HEIGHT_M = 0.8, 0.2
 """A sensor between these heights sees less far over the ground, and what is far is nearer. Ground that is
@@ -33,7 +34,7 @@ def measure_health(
 
     Fog and rain take the far points; drops, flakes and dust return from the air near the sensor, where other
     beams pass; noise blurs the ground. Where the origin is not the sensor's, there is ground right under it.
-    Where the road is not the ground that was found, or mirrors, much lies below the ground.
+    Where the road is not the ground that was found, much lies below the ground.
 
     Args:
       sweep: of N rows.
