@@ -227,11 +227,9 @@ class Case:
             )
         )
         free, hit = _words_of(*blocks)
-        support = jnp.asarray(self.evidence.support, jnp.float32)
         return Evidence(
             free=free,
             hit=hit,
-            support=support,
             steepest=jnp.float32(self.evidence.steepest),
             num_ranges=CONFIG.evidence.num_ranges,
         )

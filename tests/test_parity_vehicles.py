@@ -103,13 +103,14 @@ def test_points_round_boxes_are_those_of_the_reference(cases):
 @jax.jit
 def score_boxes(columns, prior):
     around = NeighbourhoodCounts(jnp.stack(columns["around"], axis=1))
-    seen = (columns[name] for name in ("num_points", "hit", "free_length", "support", "rho", "objective"))
+    seen = (columns[name] for name in ("num_points", "hit", "free_length", "objective"))
     where = (columns[name] for name in ("rho", "reach", "seen_width", "is_open", "in_threes"))
     early = scoring.evidence_score(*seen, SETTINGS)
     own = scoring.own_score(around, columns["num_points"], prior)
     late, top_unseen = scoring.neighbourhood_score(around, *where, prior, SETTINGS)
     by_size = scoring.size_score(columns["length"], columns["width"], prior)
-    return early * by_size * own * late * prior.prior_weight, top_unseen
+    early = early * by_size * prior.prior_weight * scoring.far_score(columns["rho"], prior, SETTINGS)
+    return early * own * late, top_unseen
 
 
 @jax.jit
@@ -128,7 +129,6 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
         "num_points": rng.integers(1, 300, MAX_BOXES),
         "hit": rng.uniform(0, 1, MAX_BOXES),
         "free_length": rng.uniform(0, 0.2, MAX_BOXES) ** 2,
-        "support": rng.integers(0, 30, MAX_BOXES),
         "objective": rng.uniform(2, 3, MAX_BOXES),
         "rho": rng.uniform(2, 80, MAX_BOXES),
         "reach": rng.uniform(0.5, 4, MAX_BOXES),
@@ -151,7 +151,7 @@ def test_scores_are_those_of_the_reference_over_all_classes_and_gates():
     expected, expected_unseen = [], []
     for row in range(MAX_BOXES):
         around = reference.NeighbourhoodCounts(*(float(value[row]) for value in columns["around"]))
-        one = {name: float(columns[name][row]) for name in ("hit", "free_length", "support")}
+        one = {name: float(columns[name][row]) for name in ("hit", "free_length")}
         length, width, seen_width = (float(columns[name][row]) for name in ("length", "width", "seen_width"))
         box = np.array([columns["rho"][row], 0.0, length, width, 0.0])
         expected.append(

@@ -575,7 +575,7 @@ def test_the_share_of_hit_rays_is_the_share_of_the_span_that_holds_returns():
     assert rays.hit[0] == pytest.approx(share, abs=0.015)
 
 
-def test_without_evidence_every_ray_counts_as_hit_and_the_ground_is_not_looked_at():
+def test_without_evidence_every_ray_counts_as_hit():
     cluster = reference.Cluster(np.arange(50), 0.2, 1.5)
     box = reference.CompletedBox(np.array([10.0, 0, 3.9, 1.63, 0]), np.inf, 3.9, 1.63)
     completed = reference.Completed([reference.ClassHypothesis(0, Label.CAR)], [box], 1)
@@ -583,19 +583,9 @@ def test_without_evidence_every_ray_counts_as_hit_and_the_ground_is_not_looked_a
     nothing = reference.index_obstacles(np.zeros((0, 3)), np.zeros(0), np.zeros(0, int))
     (candidate,) = reference.score_boxes(completed, None, lambda *_: np.inf, [cluster], nothing, config)
     around = reference.cluster_alone(50, 1.5)
-    found = {"hit": 1.0, "free_length": 0.0, "support": None}
+    found = {"hit": 1.0, "free_length": 0.0}
     expected = reference.score_box(box, CAR, around=around, num_points=50, **found, config=config.vehicles)
     assert candidate.score == expected > 0
-
-
-def test_ground_support_counts_the_seven_by_seven_cells_round_a_place():
-    rng = np.random.default_rng(8)
-    xyz = rng.uniform([-30, -30, -0.3], [30, 30, 0.3], (5000, 3))
-    evidence = reference.build_evidence(xyz, xyz[:, 2], SENSOR_HEIGHT_M, even_ground, EVIDENCE)
-    for place in ([0.5, 0.5], [-12.3, 7.7], [29.0, -29.0]):
-        low = np.floor(place) - 3
-        inside = ((xyz[:, :2] >= low) & (xyz[:, :2] < low + 7)).all(axis=1) & (np.abs(xyz[:, 2]) < 0.15)
-        assert reference.ground_support(evidence, np.array(place)) == inside.sum()
 
 
 # ---------------------------------------------------------------- completion
@@ -915,7 +905,6 @@ PERFECT = {
     "num_points": 100,
     "hit": 1.0,
     "free_length": 0.0,
-    "support": 100.0,
 }
 PERFECT_BOX = np.array([10.0, 0.0, 3.9, 1.63, 0.0])
 
@@ -942,7 +931,6 @@ def test_the_highest_beam_is_where_it_passes_the_nearest_point_of_a_box():
 def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     score, around = score_of, PERFECT["around"]
     assert score() == 1
-    assert score(support=None) == 1
     assert score(moved(PERFECT_BOX, length=-0.8)) == pytest.approx(np.exp(-1))
     assert score(moved(PERFECT_BOX, length=2.0)) == pytest.approx(np.exp(-1))
     assert score(moved(PERFECT_BOX, width=0.4)) == pytest.approx(np.exp(-1))
@@ -950,10 +938,8 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     assert score(hit=0.25) == 0.25
     assert score(prior=dataclasses.replace(CAR, prior_weight=0.5)) == 0.5
     assert score(free_length=0.15) == pytest.approx(np.exp(-1))
-    assert score(support=4.5) == pytest.approx(0.5)
-    # Twice as far away an eighth of the points say as much.
-    assert score(moved(PERFECT_BOX, x=40), support=4.5) == pytest.approx(0.5)
-    assert score(moved(PERFECT_BOX, x=90), support=0.125) == pytest.approx(0.5)
+    assert score(moved(PERFECT_BOX, x=30)) == 1
+    assert score(moved(PERFECT_BOX, x=80)) == pytest.approx((45 / 90) ** 4)
     assert score(objective=2.4) == pytest.approx(0.5)
     assert score(around=dataclasses.replace(around, num_ring=25)) == pytest.approx(np.exp(-2))
     assert score(around=dataclasses.replace(around, top=2.1)) == pytest.approx(np.exp(-1))
@@ -1228,6 +1214,7 @@ NO_TWIN = {
     "clustering.find_statistics": "fills a table; select_clusters of the reference goes by the points",
     "clustering.lowest_z": "a minimum over the points of each cluster",
     "descriptors.point_moments": "sums over lists; shape_descriptors of the reference goes by the points",
+    "evidence.weigh_boxes": "cast_rays in chunks, with the hits of the class",
     "hull.extreme_points": "thins out what cannot reach the hull",
     "hull.find_bounds": "the frame of those",
     "hull.trace_hulls": "convex_hulls in chunks",

@@ -56,6 +56,9 @@ class ClassPrior:
     """Wider measured extents are not such a vehicle."""
     min_box_height_m: Scalar
     """Least height of a box: measured tops are too low."""
+    far_score_from_m: Scalar
+    """m, range from which on the score falls (``vehicles.far_score_power``): few beams meet a vehicle there,
+    and other things pass for one more easily."""
     prior_weight: Scalar
     """Factor of the score: how common the class is relative to the car, softened."""
     count_max_height_m: Scalar
@@ -186,6 +189,7 @@ class Label(enum.IntEnum):
         max_length_m=6.5,
         max_width_m=2.4,
         min_box_height_m=1.48,
+        far_score_from_m=45.0,
         prior_weight=1.0,
         count_max_height_m=2.2,
         recess_m=0.3,
@@ -212,7 +216,8 @@ class Label(enum.IntEnum):
         max_length_m=7.5,
         max_width_m=2.6,
         min_box_height_m=1.8,
-        prior_weight=0.6,
+        far_score_from_m=45.0,
+        prior_weight=0.7,
         count_max_height_m=2.7,
         recess_m=0.15,
         upright_from_m=10.0,
@@ -238,6 +243,7 @@ class Label(enum.IntEnum):
         max_length_m=18.0,
         max_width_m=3.2,
         min_box_height_m=2.6,
+        far_score_from_m=100.0,
         prior_weight=0.5,
         count_max_height_m=4.2,
         recess_m=-1.0,

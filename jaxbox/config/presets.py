@@ -55,7 +55,7 @@ class DetectorConfig:
             evidence=EvidenceConfig(enabled=False),
             box=BoxConfig(criterion="area", fit_to="hull", scene_direction=False),
             completion=CompletionConfig(mode="none"),
-            vehicles=VehicleConfig(neighbourhood=False, row_extent=1.0),
+            vehicles=VehicleConfig(neighbourhood=False, row_extent=1.0, far_score_power=0.0),
         )
 
     @classmethod

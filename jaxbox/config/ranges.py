@@ -55,14 +55,13 @@ _POSITIVE = """
     ground.tolerance_m ground.smoothing_m ground.max_height_m
     clustering.max_extent_m completion.end_slope completion.end_points
     evidence.hit_max_height_m evidence.raised_hit_max_height_m evidence.free_max_height_m
-    evidence.support_height_m
     box.slab_max_height_m box.min_distance_m box.direction_sigma_deg
     vehicles.classes.length_m vehicles.classes.width_m vehicles.classes.height_m
     vehicles.classes.length_below_m vehicles.classes.length_above_m vehicles.classes.width_tolerance_m
     vehicles.classes.height_below_m vehicles.classes.height_above_m
     vehicles.classes.max_height_m vehicles.classes.max_length_m vehicles.classes.max_width_m
-    vehicles.classes.count_max_height_m
-    vehicles.saturation_points vehicles.support_points vehicles.support_range_m vehicles.recess_share
+    vehicles.classes.count_max_height_m vehicles.classes.far_score_from_m
+    vehicles.saturation_points vehicles.recess_share
     vehicles.free_scale vehicles.objective_softness vehicles.overhead_gap_m
     gate acceleration_mps2 position_sd_m unseen_sd_m birth_speed_sd_mps max_gap_s max_ego_speed_mps
 """

@@ -208,8 +208,6 @@ class EvidenceConfig:
     """See ``free_min_height_m``."""
     end_gap_m: Scalar = 0.3
     """A beam that ends between those heights shows free space up to this before its return."""
-    support_height_m: Scalar = 0.15
-    """Points within this of the ground support the ground round a box."""
 
 
 @config_class
@@ -417,10 +415,9 @@ class VehicleConfig:
     tall_upright_score: Scalar = 0.4
     """The same for what is as high as ``ClassPrior.upright_from_m`` where nearly the class's width was
     measured, and for vehicles in rows and lines of three or more: all but one face of them is hidden."""
-    support_points: Scalar = 10.0
-    """score x min(1, ground points round the box / this)."""
-    support_range_m: Scalar = 50.0
-    """Beyond this range fewer are asked for, by its cube: the road returns fewer, in rings far apart."""
+    far_score_power: Scalar = 4.0
+    """score x (from / range)^power beyond a range of the class, `ClassPrior.far_score_from_m`. 0 leaves it as
+    it is."""
     objective_gate: Scalar = 2.4
     """score / (1 + exp(-(J - gate) / softness)), J the objective of the completion."""
     objective_softness: Scalar = 0.13

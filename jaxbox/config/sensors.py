@@ -35,7 +35,7 @@ SENSORS: Mapping[int, SensorChanges] = {
             # Rings one above the other lie far apart, but on one car.
             "clustering": {"adaptive_start_m": 5.0, "adaptive_growth": 0.07},
             "box": {"slab_max_height_m": 1.0},
-            "vehicles": {"top_grade": 0.015, "saturation_points": 25.0, "support_points": 2.5},
+            "vehicles": {"top_grade": 0.015, "saturation_points": 25.0},
         },
         cells=0.5,
     ),
@@ -44,7 +44,7 @@ SENSORS: Mapping[int, SensorChanges] = {
             "ground": {"smoothing_m": 3.0},
             "clustering": {"adaptive_start_m": 5.0, "adaptive_growth": 0.04},
             "box": {"slab_max_height_m": 1.0},
-            "vehicles": {"top_grade": 0.015, "saturation_points": 50.0, "support_points": 5.0},
+            "vehicles": {"top_grade": 0.015, "saturation_points": 50.0},
         },
         cells=0.75,
     ),

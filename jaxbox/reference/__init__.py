@@ -60,11 +60,9 @@ from jaxbox.reference.evidence import (
     cast_rays,
     closed_free_length,
     first_returns,
-    ground_support,
     is_raised,
     observe,
     steepest_beam,
-    weigh_boxes,
 )
 from jaxbox.reference.filtering import (
     filter_outliers,
@@ -134,6 +132,7 @@ from jaxbox.reference.scoring import (
     early_score,
     end_where_seen,
     evidence_score,
+    far_score,
     keep_best,
     neighbourhood_score,
     non_max_suppression,
@@ -244,6 +243,7 @@ __all__ = [
     "evidence_score",
     "extend",
     "extend_away",
+    "far_score",
     "filter_outliers",
     "find_cells",
     "find_clusters",
@@ -260,7 +260,6 @@ __all__ = [
     "front_log_odds",
     "gather_obstacles",
     "ground_elevation",
-    "ground_support",
     "height_above_ground",
     "height_above_planes",
     "hit_share",
@@ -322,6 +321,5 @@ __all__ = [
     "turn_back",
     "turn_sweep",
     "visible_end",
-    "weigh_boxes",
     "wrap_yaw",
 ]

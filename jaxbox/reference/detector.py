@@ -93,7 +93,7 @@ def _read(xyz: np.ndarray, config: DetectorConfig, seed: int) -> assembly.Refere
         priors = [config.vehicles.classes[hypothesis.label] for hypothesis in completed.hypotheses]
         raised = np.array([evidence.is_raised(prior) for prior in priors], bool)
         num_rays = config.completion.num_final_rays
-        rays = evidence.weigh_boxes(seen, boxes, num_rays=num_rays, raised=raised)
+        rays = evidence.cast_rays(seen, boxes, num_rays=num_rays, raised=raised)
     steepest = None if seen is None else seen.steepest
     reach = functools.partial(scoring.reach_of_beams, steepest=steepest, elevation=elevation)
     candidates = scoring.score_boxes(completed, rays, reach, clusters, obstacles, config)

@@ -3,15 +3,10 @@
 from collections.abc import Callable
 
 import numpy as np
-from scipy import ndimage
 
 from jaxbox.config import ClassPrior, EvidenceConfig, Scalar
 from jaxbox.reference.state import Evidence, Ground, RayFractions, Sweep
 
-SUPPORT_HALF_M = 100
-"""The ground support grid covers |x|, |y| below this in cells of 1 m."""
-SUPPORT_WINDOW = 7
-"""Ground points are counted over that many cells in x and y round a box's centre."""
 MIN_DESCENT_M = 1e-3
 """A beam that falls less than this before its return is level and shows nothing below it."""
 FULL_BEAM = 1 - 1e-6
@@ -79,12 +74,11 @@ def build_evidence(
       height: (n,) m above the ground.
       sensor_height_m: height of the sensor above the ground.
       ground_elevation: of the ground under the beams.
-      config: the grid, and the heights, all exclusive, of what is a hit, free, or support.
+      config: the grid, and the heights, all exclusive, of what is a hit and what is free.
 
     Returns:
       The evidence.
     """
-    support = _count_support(xyz, height, config)
     num_azimuths, num_ranges, range_cell_m = config.num_azimuths, config.num_ranges, config.range_cell_m
     rho = np.hypot(xyz[:, 0], xyz[:, 1])
     far = rho >= config.min_range_m
@@ -108,7 +102,7 @@ def build_evidence(
     free = np.cumsum(steps, axis=1) > 0
     steepest = steepest_beam(xyz[:, 2], rho)
     hits, raised_hits = hits_below(config.hit_max_height_m), hits_below(config.raised_hit_max_height_m)
-    return Evidence(hits, raised_hits, _sums_before(free), support, steepest, range_cell_m)
+    return Evidence(hits, raised_hits, _sums_before(free), steepest, range_cell_m)
 
 
 def steepest_beam(z: np.ndarray, rho: np.ndarray) -> float:
@@ -185,63 +179,6 @@ def _free_interval(
     rho = np.hypot(xyz[:, 0], xyz[:, 1])
     end = rho * leaves - np.where(leaves >= FULL_BEAM, config.end_gap_m, 0.0)
     return np.where(falls, rho * enters, 0.0), np.where(falls, end, 0.0)
-
-
-def _count_support(xyz: np.ndarray, height: np.ndarray, config: EvidenceConfig) -> np.ndarray:
-    """(200, 200) int: ground points in the window round each cell of 1 m."""
-    ground = np.abs(height) < config.support_height_m
-    ground &= (np.abs(xyz[:, :2]) < SUPPORT_HALF_M).all(axis=1)
-    cell = np.floor(xyz[ground, :2] + SUPPORT_HALF_M).astype(int)
-    counts = np.zeros((2 * SUPPORT_HALF_M, 2 * SUPPORT_HALF_M), int)
-    np.add.at(counts, tuple(cell.T), 1)
-    window = np.ones(SUPPORT_WINDOW, int)
-    for axis in range(2):
-        counts = ndimage.correlate1d(counts, window, axis=axis, mode="constant")
-    return counts
-
-
-def ground_support(evidence: Evidence, xy: np.ndarray) -> np.ndarray:
-    """Ground points in the 7 x 7 cells of 1 m round a place.
-
-    Args:
-      evidence: of the sweep.
-      xy: (..., 2) m; beyond the grid its border holds.
-
-    Returns:
-      (...) int.
-    """
-    cell = np.clip(np.floor(xy + SUPPORT_HALF_M), 0, 2 * SUPPORT_HALF_M - 1).astype(int)
-    return evidence.support[cell[..., 0], cell[..., 1]]
-
-
-def weigh_boxes(
-    evidence: Evidence, boxes: np.ndarray, *, num_rays: int, raised: np.ndarray | bool = False
-) -> tuple[RayFractions, np.ndarray]:
-    """What the rays over each box met, and the ground support round it.
-
-    Args:
-      evidence: of the sweep.
-      boxes: (B, 5): x, y, length, width in m and yaw in rad.
-      num_rays: rays a box.
-      raised: (B,), see `cast_rays`.
-
-    Returns:
-      The fractions, and (B,) int: ground points round its centre or, if more, round its point nearest to the
-      sensor, see `ground_support`.
-    """
-    support = [ground_support(evidence, place) for place in (boxes[:, :2], _nearest_points(boxes))]
-    return cast_rays(evidence, boxes, num_rays=num_rays, raised=raised), np.maximum(*support)
-
-
-def _nearest_points(boxes: np.ndarray) -> np.ndarray:
-    """(B, 2) m: the point of each box that is nearest to the sensor."""
-    x, y, length, width, yaw = boxes.T
-    along, across = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
-    nearest = np.zeros((2, len(boxes)))
-    for axis, size in ((along, length), (across, width)):
-        middle = axis[0] * x + axis[1] * y
-        nearest += axis * np.clip(0.0, middle - size / 2, middle + size / 2)
-    return nearest.T
 
 
 def cast_rays(

@@ -41,7 +41,7 @@ MAX_END_MARGIN_M = 0.4
 
 def score_boxes(
     completed: Completed,
-    rays: tuple[RayFractions, np.ndarray] | None,
+    rays: RayFractions | None,
     reach: Callable[[np.ndarray, float], float],
     clusters: Sequence[Cluster],
     obstacles: Obstacles,
@@ -51,7 +51,7 @@ def score_boxes(
 
     Args:
       completed: q boxes.
-      rays: what the rays over each box met, and the ground support round it; None without evidence.
+      rays: what the rays over each box met; None without evidence.
       reach: how high the highest beam is over a box (5,) whose lowest point has some z, see
         `reach_of_beams`.
       clusters: of all maps.
@@ -64,7 +64,7 @@ def score_boxes(
     in_row = np.array([box.in_row for box in completed.boxes], bool)
     early = _early_scores(completed, rays, clusters, in_row, config.vehicles)
     in_threes = in_row | _in_lines(completed, early, config.vehicles)
-    is_open = np.ones(len(early)) if rays is None else rays[0].open
+    is_open = np.ones(len(early)) if rays is None else rays.open
 
     def judge(row: int, hypothesis: ClassHypothesis, box: CompletedBox) -> Candidate:
         cluster, prior = clusters[hypothesis.cluster], config.vehicles.classes[hypothesis.label]
@@ -92,22 +92,21 @@ def score_boxes(
 
 def _early_scores(
     completed: Completed,
-    rays: tuple[RayFractions, np.ndarray] | None,
+    rays: RayFractions | None,
     clusters: Sequence[Cluster],
     in_row: np.ndarray,
     config: VehicleConfig,
 ) -> np.ndarray:
     """(q,) the part of the scores that needs no look at the surroundings."""
     early = []
-    hits = None if rays is None else hit_share(rays[0], in_row)
+    hits = None if rays is None else hit_share(rays, in_row)
     for row, (hypothesis, box) in enumerate(zip(completed.hypotheses, completed.boxes, strict=True)):
         prior = config.classes[hypothesis.label]
-        hit, free_length, support = 1.0, 0.0, None
+        hit, free_length = 1.0, 0.0
         if rays is not None and hits is not None:
-            seen = hits, closed_free_length(rays[0], prior), rays[1]
-            hit, free_length, support = (float(a[row]) for a in seen)
+            hit, free_length = float(hits[row]), float(closed_free_length(rays, prior)[row])
         num_points = len(clusters[hypothesis.cluster].members)
-        rates = {"hit": hit, "free_length": free_length, "support": support}
+        rates = {"hit": hit, "free_length": free_length}
         early.append(early_score(box, prior, num_points=num_points, **rates, config=config))
     return np.array(early)
 
@@ -239,7 +238,6 @@ def score_box(
     num_points: int,
     hit: float,
     free_length: float,
-    support: float | None,
     config: VehicleConfig,
     reach: float = np.inf,
     is_open: float = 1.0,
@@ -254,7 +252,6 @@ def score_box(
       num_points: points of the cluster.
       hit: share of the rays that end at the box.
       free_length: share of the box seen to be free.
-      support: ground points round the box, or None where they were not counted.
       config: of the score.
       reach: m above the ground, height of the highest beam where the box begins.
       is_open: share of the rays that see free space in the box.
@@ -271,7 +268,6 @@ def score_box(
         num_points=num_points,
         hit=hit,
         free_length=free_length,
-        support=support,
         config=config,
     )
     rho = float(np.hypot(box.box[0], box.box[1]))
@@ -287,14 +283,14 @@ def early_score(
     num_points: int,
     hit: float,
     free_length: float,
-    support: float | None,
     config: VehicleConfig,
 ) -> float:
     """The part of the score that needs no look at what surrounds the box; see `score_box`."""
     if box.longest_m < config.row_extent * config.min_extent_m:
         return 0.0
     rho = float(np.hypot(box.box[0], box.box[1]))
-    score = evidence_score(num_points, hit, free_length, support, rho, box.objective, config)
+    score = evidence_score(num_points, hit, free_length, box.objective, config)
+    score *= far_score(rho, prior, config)
     return float(score * size_score(box.box[2:4], prior) * prior.prior_weight)
 
 
@@ -307,8 +303,6 @@ def evidence_score(
     num_points: int,
     hit: float,
     free_length: float,
-    support: float | None,
-    rho: float,
     objective: float,
     config: VehicleConfig,
 ) -> float:
@@ -318,21 +312,31 @@ def evidence_score(
       num_points: points of the cluster.
       hit: share of the rays that end at the box.
       free_length: share of the box seen to be free.
-      support: ground points round the box, or None where they were not counted.
-      rho: m, range of the box.
       objective: J of the completion.
-      config: (points / saturation)^power, exp(-(free_length / scale)^2), full score from a number of ground
-        points, x (range / rho)^3 beyond a range, and 1 / (1 + exp(-(J - gate) / softness)).
+      config: (points / saturation)^power, exp(-(free_length / scale)^2), and
+        1 / (1 + exp(-(J - gate) / softness)).
 
     Returns:
       In [0, 1].
     """
     score = hit * min(1.0, num_points / config.saturation_points) ** config.sparseness_power
     score *= np.exp(-((free_length / config.free_scale) ** 2))
-    if support is not None:
-        thinned = max(1.0, rho / config.support_range_m) ** 3
-        score *= min(1.0, (support + 0.5) * thinned / config.support_points)
     return float(score * expit((objective - config.objective_gate) / config.objective_softness))
+
+
+def far_score(rho: float, prior: ClassPrior, config: VehicleConfig) -> float:
+    """The part of the score that falls with the range, as fewer beams meet a vehicle.
+
+    Args:
+      rho: m, range of the box.
+      prior: of the class.
+      config: the power.
+
+    Returns:
+      In [0, 1].
+    """
+    from_m = float(prior.far_score_from_m)
+    return (from_m / max(rho, from_m)) ** float(config.far_score_power)
 
 
 def size_score(size: np.ndarray, prior: ClassPrior) -> float:

@@ -124,7 +124,7 @@ class Rectangle:
 
 @dataclasses.dataclass(frozen=True)
 class Evidence:
-    """Hits and free space on a polar grid, and ground points on a square one."""
+    """Hits and free space on a polar grid."""
 
     hit_sums: np.ndarray
     """(azimuths, ranges + 1) int: returns between the hit heights in all range cells before."""
@@ -132,8 +132,6 @@ class Evidence:
     """Likewise, returns that are hits of vehicles with a raised body."""
     free_sums: np.ndarray
     """(azimuths, ranges + 1) int: free range cells before."""
-    support: np.ndarray
-    """(200, 200) int: ground points in the 7 x 7 cells of 1 m round each."""
     steepest: float
     """Rise of the highest beam, m/m."""
     range_cell_m: float

@@ -115,7 +115,7 @@ def levels_with_area(lowest: jax.Array, half_m: float, config: GroundConfig) -> 
     )
     two = count[:-1] + count[1:]
     near = two[plane_row - AT_PLANE_LEVELS : plane_row + AT_PLANE_LEVELS - 1]
-    is_at_plane_or_above = np.array(PLANE_LEVELS)[:, None] >= -AT_PLANE_LEVELS
+    is_at_plane_or_above = jnp.array(np.array(PLANE_LEVELS)[:, None] >= -AT_PLANE_LEVELS)
     return is_at_plane_or_above | (two >= config.min_deep_ratio * jnp.max(near, axis=0, keepdims=True))
 
 

@@ -7,8 +7,6 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.config import DetectorConfig, EvidenceConfig
-from jaxbox.geometry.planar import rotate
-from jaxbox.stages._grids import sum_of_neighbours
 from jaxbox.stages._priors import is_raised, prior_of
 from jaxbox.stages.state import (
     Boxes,
@@ -23,18 +21,10 @@ from jaxbox.stages.state import (
 from jaxbox.xla import chunks
 from jaxbox.xla.arithmetic import arctan2, cos_sin
 from jaxbox.xla.bits import sum_packed
-from jaxbox.xla.indexing import lookup, scatter
+from jaxbox.xla.indexing import scatter
 from jaxbox.xla.loops import apply_in_turn, fast_axis, map_rows
 from jaxbox.xla.range_bits import draw_beams, next_set, set_before, words_at
 from jaxbox.xla.rows import sum_after
-
-SUPPORT_HALF_M = 100.0
-"""The ground support grid covers |x|, |y| below this, in cells of 1 m."""
-
-
-SUPPORT_REACH = 3
-"""Cells on either side that count as the ground round a cell: 7 x 7."""
-
 
 HIT_BEFORE_M, HIT_AFTER_M, HIT_BEYOND_M = 0.35, 0.6, 0.25
 """A ray hits a box with a return from this before its entry to this after, or this past its exit."""
@@ -116,7 +106,7 @@ def build_evidence(
       mask: (N,) bool, points that count.
       sensor_height_m: () float32, m, above the ground.
       ground_elevation: asks for the ground under the beams.
-      config: the grid, A azimuths by R ranges, and the heights of what is a hit, free, or support.
+      config: the grid, A azimuths by R ranges, and the heights of what is a hit and what is free.
 
     Returns:
       The evidence; all zero where no point counts.
@@ -155,7 +145,6 @@ def build_evidence(
     return Evidence(
         free=free,
         hit=hit,
-        support=_ground_support(xyz, height, mask, config.support_height_m),
         steepest=steepest_beam(xyz[:, 2], rho, mask),
         num_ranges=num_ranges,
     )
@@ -220,34 +209,6 @@ def azimuth_cell(azimuth: jax.Array, num_azimuths: int) -> jax.Array:
     return jnp.where(cell < num_azimuths, cell, 0)
 
 
-def _ground_support(
-    xyz: jax.Array, height: jax.Array, mask: jax.Array, support_height_m: jax.Array | float
-) -> jax.Array:
-    n = round(2 * SUPPORT_HALF_M)
-    i, j = (jnp.clip(jnp.floor(xyz[:, a] + SUPPORT_HALF_M).astype(jnp.int32), 0, n - 1) for a in (0, 1))
-    on_ground = mask & (jnp.abs(height) < support_height_m)
-    place = jnp.where(on_ground, i * n + j, n * n)
-    count = scatter("add", jnp.zeros(n * n, jnp.int32), place, 1).reshape(n, n)
-    for axis in (0, 1):
-        count = sum_of_neighbours(count, axis, SUPPORT_REACH)
-    return count.astype(jnp.float32)
-
-
-def ground_support(evidence: Evidence, xy: jax.Array) -> jax.Array:
-    """Ground points in the 7 x 7 m round a place.
-
-    Args:
-      evidence: of the sweep.
-      xy: (..., 2) float32, m.
-
-    Returns:
-      (...) float32.
-    """
-    n = evidence.support.shape[0]
-    index = jnp.clip(jnp.floor(xy + SUPPORT_HALF_M).astype(jnp.int32), 0, n - 1)
-    return lookup(evidence.support, index[..., 0], index[..., 1])
-
-
 def cast_rays(
     evidence: Evidence,
     boxes: FlatBoxes,
@@ -304,8 +265,8 @@ def cast_rays(
 
 def weigh_boxes(
     evidence: Evidence, boxes: Boxes, hypotheses: ClassHypotheses, config: DetectorConfig
-) -> tuple[RayFractions, jax.Array]:
-    """What the rays over each box met, and the ground support round it.
+) -> RayFractions:
+    """What the rays over each box met.
 
     Args:
       evidence: of the sweep.
@@ -314,28 +275,17 @@ def weigh_boxes(
       config: the classes, the rays over each box, and what the evidence was built with.
 
     Returns:
-      rays: (Q,) fractions.
-      support: (Q,) float32, ground points round its centre or, if more, round its point nearest to the
-        sensor: the middle of a long vehicle may lie out of sight. See `ground_support`.
+      (Q,) fractions.
     """
 
     num_rays = config.completion.num_final_rays
 
-    def weigh(rows: tuple[Boxes, jax.Array]) -> tuple[RayFractions, jax.Array]:
+    def weigh(rows: tuple[Boxes, jax.Array]) -> RayFractions:
         boxes, label = rows
         raised = is_raised(prior_of(config.vehicles.classes, label))
-        support = [ground_support(evidence, place) for place in (boxes.center, _nearest_point(boxes))]
-        rays = cast_rays(evidence, boxes, config.evidence, num_rays=num_rays, raised=raised)
-        return rays, jnp.maximum(*support)
+        return cast_rays(evidence, boxes, config.evidence, num_rays=num_rays, raised=raised)
 
     return map_rows(weigh, (boxes, hypotheses.label), num_rows=hypotheses.num, chunk=chunks.RAYS)
-
-
-def _nearest_point(boxes: Boxes) -> jax.Array:
-    """(Q, 2) m: the point of each box that is nearest to the sensor."""
-    half = jnp.stack([boxes.length, boxes.width], axis=1) / 2
-    center = rotate(boxes.center, -boxes.yaw)
-    return rotate(center - jnp.clip(center, -half, half), boxes.yaw)
 
 
 Fan = tuple[jax.Array, ...]

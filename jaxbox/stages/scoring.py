@@ -73,7 +73,7 @@ MAX_END_MARGIN_M = 0.4
 
 def score_boxes(
     completed: Completed,
-    rays: tuple[RayFractions, jax.Array] | None,
+    rays: RayFractions | None,
     clusters: Clusters,
     obstacles: Obstacles,
     ground_elevation: GroundElevation,
@@ -85,7 +85,7 @@ def score_boxes(
 
     Args:
       completed: Q boxes.
-      rays: what the rays over each box met, and the ground support round it; None without evidence.
+      rays: what the rays over each box met; None without evidence.
       clusters: of P rows.
       obstacles: all points above the ground.
       ground_elevation: asks for the ground under points.
@@ -107,7 +107,7 @@ def score_boxes(
         size = jnp.stack([box.length, box.width, wrap_yaw(box.yaw)], axis=1)
         rectangle = jnp.concatenate([box.center, size], axis=1)
         of_hypothesis = take(hypotheses.label, chosen), take(hypotheses.cluster, chosen)
-        is_open = jnp.ones_like(box.yaw) if rays is None else take(rays[0].open, chosen)
+        is_open = jnp.ones_like(box.yaw) if rays is None else take(rays.open, chosen)
         return rectangle, *of_hypothesis, take(score, chosen), box.measured, box.in_row, is_open
 
     picked = map_rows(pick, chosen, num_rows=num)
@@ -146,26 +146,25 @@ def score_boxes(
 
 def _early_scores(
     completed: Completed,
-    rays: tuple[RayFractions, jax.Array] | None,
+    rays: RayFractions | None,
     clusters: Clusters,
     config: VehicleConfig,
 ) -> jax.Array:
     """(Q,) the part of the score that needs no look at the surroundings; no other part exceeds 1."""
     hypotheses = completed.hypotheses
 
-    def score(rows: tuple[Boxes, jax.Array, jax.Array, tuple[RayFractions, jax.Array] | None]) -> jax.Array:
+    def score(rows: tuple[Boxes, jax.Array, jax.Array, RayFractions | None]) -> jax.Array:
         boxes, label, cluster, rays = rows
         prior = prior_of(config.classes, label)
         ones = jnp.ones_like(boxes.yaw)
-        hit, free_length, support = ones, 0 * ones, config.support_points * ones
+        hit, free_length = ones, 0 * ones
         if rays is not None:
-            hit, free_length = hit_share(rays[0], boxes.in_row), closed_free_length(rays[0], prior)
-            support = rays[1]
+            hit, free_length = hit_share(rays, boxes.in_row), closed_free_length(rays, prior)
         num_points = take(clusters.num_points, cluster)
         rho = jnp.linalg.norm(boxes.center, axis=1)
-        by_evidence = evidence_score(num_points, hit, free_length, support, rho, boxes.objective, config)
+        by_evidence = evidence_score(num_points, hit, free_length, boxes.objective, config)
         by_size = size_score(boxes.length, boxes.width, prior)
-        score = by_evidence * by_size * prior.prior_weight
+        score = by_evidence * by_size * prior.prior_weight * far_score(rho, prior, config)
         large_enough = jnp.max(boxes.measured, axis=1) >= config.row_extent * config.min_extent_m
         return jnp.where((boxes.objective > NOT_A_BOX) & large_enough, score, 0)
 
@@ -266,8 +265,6 @@ def evidence_score(
     num_points: jax.Array,
     hit: jax.Array,
     free_length: jax.Array,
-    support: jax.Array,
-    rho: jax.Array,
     objective: jax.Array,
     config: VehicleConfig,
 ) -> jax.Array:
@@ -277,21 +274,34 @@ def evidence_score(
       num_points: (P,) int32, points of the cluster.
       hit: (P,) float32, fraction of rays.
       free_length: (P,) float32, fraction of the rays' length.
-      support: (P,) float32, ground points round the box.
-      rho: (P,) float32, m, range of the box.
       objective: (P,) float32, J of the box.
-      config: (points / saturation)^power, exp(-(free_length / scale)^2), full score from that many ground
-        points, x (range / rho)^3 beyond a range, and 1 / (1 + exp(-(J - gate) / softness)).
+      config: (points / saturation)^power, exp(-(free_length / scale)^2), and
+        1 / (1 + exp(-(J - gate) / softness)).
 
     Returns:
       (P,) float32 in [0, 1].
     """
     dense = jnp.minimum(num_points.astype(jnp.float32) / config.saturation_points, 1)
     dense = dense**config.sparseness_power
-    thinned = jnp.maximum(rho / config.support_range_m, 1)
-    grounded = jnp.minimum((support + 0.5) * thinned**3 / config.support_points, 1)
     gate = jax.nn.sigmoid((objective - config.objective_gate) / config.objective_softness)
-    return dense * jnp.exp(-((free_length / config.free_scale) ** 2)) * hit * grounded * gate
+    return dense * jnp.exp(-((free_length / config.free_scale) ** 2)) * hit * gate
+
+
+def far_score(rho: jax.Array, prior: ClassPrior, config: VehicleConfig) -> jax.Array:
+    """The part of the score that falls with the range, as fewer beams meet a vehicle.
+
+    Args:
+      rho: (P,) float32, m, range of the box.
+      prior: fields of (P,) float32.
+      config: the power.
+
+    Returns:
+      (P,) float32 in [0, 1].
+
+    Reference: oracle `jaxbox.reference.far_score`.
+    """
+    from_m = prior.far_score_from_m
+    return (from_m / jnp.maximum(rho, from_m)) ** config.far_score_power
 
 
 def end_where_seen(

@@ -196,8 +196,6 @@ class Evidence:
     hit: jax.Array
     """(B, 2 A) uint32: which cells of a block have a return of vehicle height, and the first beyond the block
     that has one (`next_words`); then the same with higher returns, for vehicles with a raised body."""
-    support: jax.Array
-    """(200, 200) float32: ground points in the 7 x 7 m round each 1 m cell."""
     steepest: jax.Array
     """() float32: rise of the highest beam, m/m."""
     num_ranges: int = dataclasses.field(metadata={"static": True})
