@@ -24,7 +24,7 @@ from benchmarks import common
 from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig
 from jaxbox._padding import fitting_capacity
 from jaxbox.evaluation import Selection, kitti, matching
-from jaxbox.evaluation.copies import COPIES, Copy, Frame, detect_copy, labelled_frames
+from jaxbox.evaluation.copies import COPIES, Copy, Frame, detect_copy, label_points, labelled_frames
 from jaxbox.evaluation.corruptions import CORRUPTIONS, Corruption
 from jaxbox.io import open_sweeps
 from jaxbox.viz.plots import save_figure
@@ -34,10 +34,15 @@ NUM_COPIES = 3
 METRICS = ("bev", "3d", "image")
 MIN_OVERLAP = {"Car": kitti.MIN_OVERLAP["Car"]}
 RECALL_OVERLAP = 0.5
-COLUMNS = ("3d", "bev", "image", "SOFT", "recall", "recall at the cut", "false a frame", "length", "height")
+WELL_SEEN_POINTS = 100
+COLUMNS = (
+    "3d", "bev", "image", "SOFT", "recall", "recall at the cut", "well seen", "false a frame", "length",
+    "height",
+)  # fmt: skip
 """AP at IoU .7 (R40, moderate), SOFT, and at BEV IoU .5 the recall of moderate cars by boxes of any score and
-by those from `jaxbox.DEFAULT_SCORE_THRESHOLD` on, how many of the latter a frame match no label, and by how
-much (m) the boxes found are on average too long and too high."""
+by those from `jaxbox.DEFAULT_SCORE_THRESHOLD` on, by the latter that of all cars with `WELL_SEEN_POINTS` or
+more in the clean sweep, how many of the latter a frame match no label, and by how much (m) the boxes found
+are on average too long and too high."""
 PLOTTED = {"3d": "3D AP", "SOFT": "SOFT", "recall": "recall, BEV .5 (%)"}
 
 
@@ -74,17 +79,25 @@ def measure_copy(
         labels[frame.name] = frame.labels
         together |= int(status)
         num_points += len(corrupted.xyz)
-    return score(labels, results) | {"points": num_points / len(frames)}, together
+    seen = {frame.name: label_points(frame) for frame in frames}
+    return score(labels, results, seen) | {"points": num_points / len(frames)}, together
 
 
-def score(labels: kitti.Objects, results: kitti.Objects) -> dict[str, float]:
-    """The columns of the table."""
+def score(
+    labels: kitti.Objects, results: kitti.Objects, num_points: Mapping[str, np.ndarray]
+) -> dict[str, float]:
+    """The columns of the table, of labels with so many points each."""
     curves = kitti.evaluate(labels, results, min_overlap=MIN_OVERLAP, metrics=METRICS).curves
     ap = {curve.metric: curve.r40 for curve in curves if curve.difficulty == "moderate"}
     scenes = matching.select(labels, results, Selection(difficulty="moderate"))
     every = matching.rates(scenes, metric="bev", min_overlap=RECALL_OVERLAP)
     cut = matching.cut(scenes, min_score=DEFAULT_SCORE_THRESHOLD)
     kept = matching.rates(cut, metric="bev", min_overlap=RECALL_OVERLAP)
+    well_seen = matching.select(
+        labels, results, Selection(min_points=WELL_SEEN_POINTS), num_points=num_points
+    )
+    well_seen = matching.cut(well_seen, min_score=DEFAULT_SCORE_THRESHOLD)
+    seen = matching.rates(well_seen, metric="bev", min_overlap=RECALL_OVERLAP)
     found = matching.matched_boxes(scenes, min_overlap=RECALL_OVERLAP)
     # Without a match there is no error to report.
     too_large = np.mean(found.detections - found.labels, axis=0) if len(found.labels) else np.zeros(7)
@@ -93,6 +106,8 @@ def score(labels: kitti.Objects, results: kitti.Objects) -> dict[str, float]:
         "SOFT": kitti.soft_score(labels, results),
         "recall": every.num_found / every.num_labels,
         "recall at the cut": kept.num_found / kept.num_labels,
+        # Without such a label there is none to miss.
+        "well seen": seen.num_found / seen.num_labels if seen.num_labels else 1.0,
         "false a frame": kept.num_false / len(labels),
         "length": float(too_large[3]),
         "height": float(too_large[5]),

@@ -64,14 +64,17 @@ def car(*, score=None, height=1.5, length=4.0, forward=20.0):
 def test_the_score_of_a_frame_is_that_worked_by_hand():
     labels = {"a": [car(), car(forward=30.0)]}
     found = {"a": [car(score=0.9, height=1.9, length=4.1), car(score=0.8, forward=50.0)]}
-    figures = bench_corruption.score(labels, found)
+    figures = bench_corruption.score(labels, found, {"a": np.array([99, 100])})
+    assert figures["well seen"] == 0
+    assert bench_corruption.score(labels, found, {"a": np.array([100, 99])})["well seen"] == 1
     assert figures["recall"] == figures["recall at the cut"] == 0.5
     assert figures["false a frame"] == 1
     assert figures["height"] == pytest.approx(0.4)
     assert figures["length"] == pytest.approx(0.1)
+    few = {"a": np.array([3, 3])}
     low = {"a": [car(score=0.1)]}
-    assert bench_corruption.score(labels, low)["recall at the cut"] == 0
-    assert bench_corruption.score(labels, {"a": []})["height"] == 0
+    assert bench_corruption.score(labels, low, few)["recall at the cut"] == 0
+    assert bench_corruption.score(labels, {"a": []}, few)["height"] == 0
 
 
 def test_the_recorded_corruptions_are_those_of_the_code_and_can_be_drawn(tmp_path):

@@ -343,7 +343,8 @@ def corruption() -> str:
     """Accuracy of corrupted sweeps, the clean ones first."""
     report = load("corruption")
     names = {"3d": "3D AP", "bev": "BEV AP", "SOFT": "SOFT", "recall": "recall"}
-    names |= {"recall at the cut": "recall at the cut", "false a frame": "false a frame"}
+    names |= {"recall at the cut": "recall at the cut", "well seen": "of 100 points"}
+    names |= {"false a frame": "false a frame"}
     names |= {"length": "too long m", "height": "too high m"}
     rows = [("clean", "", *(report["clean"]["mean"][n] for n in names))]
     for name, kind in report["corruptions"].items():
