@@ -415,7 +415,7 @@ class VehicleConfig:
     tall_upright_score: Scalar = 0.4
     """The same for what is as high as ``ClassPrior.upright_from_m`` where nearly the class's width was
     measured, and for vehicles in rows and lines of three or more: all but one face of them is hidden."""
-    far_score_power: Scalar = 4.0
+    far_score_power: Scalar = 3.0
     """score x (from / range)^power beyond a range of the class, `ClassPrior.far_score_from_m`. 0 leaves it as
     it is."""
     objective_gate: Scalar = 2.4
