@@ -939,7 +939,7 @@ def test_a_perfect_car_scores_one_and_each_fault_costs_its_factor():
     assert score(prior=dataclasses.replace(CAR, prior_weight=0.5)) == 0.5
     assert score(free_length=0.15) == pytest.approx(np.exp(-1))
     assert score(moved(PERFECT_BOX, x=30)) == 1
-    assert score(moved(PERFECT_BOX, x=80)) == pytest.approx((45 / 90) ** 3)
+    assert score(moved(PERFECT_BOX, x=80)) == pytest.approx((50 / 90) ** 3)
     assert score(objective=2.4) == pytest.approx(0.5)
     assert score(around=dataclasses.replace(around, num_ring=25)) == pytest.approx(np.exp(-2))
     assert score(around=dataclasses.replace(around, top=2.1)) == pytest.approx(np.exp(-1))

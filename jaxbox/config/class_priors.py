@@ -189,7 +189,7 @@ class Label(enum.IntEnum):
         max_length_m=6.5,
         max_width_m=2.4,
         min_box_height_m=1.48,
-        far_score_from_m=45.0,
+        far_score_from_m=50.0,
         prior_weight=1.0,
         count_max_height_m=2.2,
         recess_m=0.3,
