@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 
 from jaxbox.config import GroundConfig
-from jaxbox.stages._grids import moment_of_neighbours
 from jaxbox.xla.grids import enlarge_cells
 
 SHEET_HALF_M, SHEET_REACH, MIN_SHEET_SQUARES = 40.0, 2, 17
@@ -92,3 +91,28 @@ def planes_through_windows(square: jax.Array) -> tuple[jax.Array, ...]:
     rms = jnp.sqrt(jnp.maximum(ss - a * xs - b * ys, 0) / count)
     level = (s - a * x - b * y) / count
     return num, jnp.where(is_plane, level, 0), jnp.where(is_plane, jnp.hypot(a, b), jnp.inf), rms
+
+
+def moment_of_neighbours(grid: jax.Array, axis: int, reach: int, power: int) -> jax.Array:
+    """Each cell with the ones before and after it along an axis, each times its offset to a power.
+
+    Beyond the border there are none.
+
+    Args:
+      grid: any shape, float32.
+      axis: along which.
+      reach: cells on either side.
+      power: of the offset in cells.
+
+    Returns:
+      As the grid.
+    """
+    offsets = range(-reach, reach + 1)
+    weighted = [k**power * cells for k, cells in zip(offsets, _shifted(grid, axis, reach), strict=True)]
+    return functools.reduce(jnp.add, weighted)
+
+
+def _shifted(grid: jax.Array, axis: int, reach: int) -> list[jax.Array]:
+    n = grid.shape[axis]
+    padded = jnp.pad(grid, [(reach, reach) if a == axis else (0, 0) for a in range(grid.ndim)])
+    return [jax.lax.slice_in_dim(padded, k, k + n, axis=axis) for k in range(2 * reach + 1)]
