@@ -66,6 +66,7 @@ ABLATIONS = (
     Ablation("ground grid of grade 0.2", {"ground.max_grade": 0.2}),
     Ablation("ground needs no support", {"ground.min_support_share": 0.0}),
     Ablation("mirror images may be ground", {"ground.min_deep_ratio": 0.0}),
+    Ablation("few low cells may be ground", {"ground.min_low_ratio": 0.0}),
     Ablation("smooth sheets are no ground", {"ground.sheet_tolerance_m": 0.0}),
     # Proposals.
     Ablation("one map: 0.2 m", _without_maps(1, 2)),

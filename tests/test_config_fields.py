@@ -28,7 +28,7 @@ def test_the_traced_settings_are_the_leaves_that_jit_sees(config):
 @pytest.mark.parametrize("config", PRESETS, ids=DetectorConfig.presets())
 def test_each_traced_setting_reaches_its_own_leaf_and_no_other(config):
     for position, name in enumerate(traced_fields(config)):
-        changed = replace_fields(config, {name: 0.625})
+        changed = replace_fields(config, {name: 0.59375})
         differing = [
             i for i, pair in enumerate(zip(jax.tree.leaves(config), jax.tree.leaves(changed), strict=True))
             if pair[0] != pair[1]

@@ -120,15 +120,18 @@ class GroundConfig:
     """Steepest rise of such a sheet relative to the plane, m/m."""
     sheet_band_grade: Scalar = 0.2
     """Growth with range of the band in which sheets are looked for, m/m; it begins at ``band_above_m``."""
-    min_support_share: Scalar = 0.05
-    """Ground has, within 3 m, at least this share of the points up to 1.2 m above it at about its height
-    (.1 to .2 m); what lies below is a reflection. 0 asks for none."""
+    min_support_share: Scalar = 0.0375
+    """Ground has, within 3 m, at least this share of the points up to 1.2 m above it at its height (.05 to
+    .1 m); what lies below is a reflection. 0 asks for none."""
     min_support_points: Scalar = 2.0
     """And at least this many points."""
     min_deep_ratio: Scalar = 1.0
     """Of heights more than .3 m below the plane .2 m are ground only where they hold the lowest point of so
     many cells within 3 m for each cell in the fullest .2 m at the plane; what has fewer is a mirror image in
     a wet road. 0 asks for none."""
+    min_low_ratio: Scalar = 0.625
+    """Nearer to the plane .2 m of heights are ground only where they hold the lowest point of so many cells
+    within 3 m for each cell in any .2 m above them; what has fewer lies below the road. 0 asks for none."""
     smoothing_m: Scalar = 1.0
     """Standard deviation of the Gaussian that smooths the ground grid (and fills it, 4 x wider)."""
     min_height_m: Scalar = 0.2

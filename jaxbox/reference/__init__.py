@@ -83,8 +83,6 @@ from jaxbox.reference.ground import (
     height_above_ground,
     height_above_planes,
     index_obstacles,
-    least_supported,
-    levels_with_area,
     on_sheets,
     plane_elevation,
     planes_through_windows,
@@ -162,6 +160,7 @@ from jaxbox.reference.state import (
     ShapeDescriptors,
     Sweep,
 )
+from jaxbox.reference.support import least_supported, levels_with_area
 from jaxbox.reference.surroundings import (
     cluster_alone,
     count_points_around,

@@ -7,6 +7,7 @@ from scipy.spatial import KDTree
 from jaxbox.config import DetectorConfig, GroundConfig
 from jaxbox.config.schema import GROUND_CANDIDATE_CELL_M
 from jaxbox.reference.state import Ground, Obstacles, Sweep
+from jaxbox.reference.support import PLANE_LEVELS, SENSOR_LEVELS, least_supported, levels_with_area
 
 DIAGONAL_STEP = np.sqrt(2)
 """Diagonal neighbours are this many cells away."""
@@ -22,16 +23,6 @@ WIDE_POOL_CELLS = 8
 """The wide Gaussian works on squares of that many cells."""
 TRUNCATE = 3.0
 """The Gaussians end at this many standard deviations."""
-SUPPORT_SQUARE_M = 2.0
-"""Points support each other as ground in squares of this edge, and the eight round them."""
-SUPPORT_LEVELS_PER_M = 10.0
-"""Heights are compared in levels of .1 m."""
-SUPPORT_LEVELS = 12
-"""Two levels are compared with this many from the lower of them up."""
-SENSOR_LEVELS, PLANE_LEVELS = range(-100, 28), range(-13, 11)
-"""Levels about the sensor, and about the plane."""
-AT_PLANE_LEVELS = 3
-"""What is within so many levels of the plane lies at its height; what is lower lies deep below it."""
 SHEET_HALF_M, SHEET_REACH, MIN_SHEET_SQUARES = 40.0, 2, 17
 """Sheets are looked for this near, in windows of 5 x 5 squares of which so many are not empty."""
 SHEET_STEP_M, SQUARE_TOLERANCE_M = 0.2, 0.1
@@ -121,77 +112,6 @@ def cell_minima(xyz: np.ndarray, config: GroundConfig) -> np.ndarray:
     row, column = np.nonzero(np.isfinite(lowest))
     center = (np.column_stack([row, column]) + 0.5) * cell_m - half
     return np.column_stack([center, lowest[row, column]])
-
-
-def least_supported(
-    z: np.ndarray,
-    xy: np.ndarray,
-    halves_m: np.ndarray,
-    levels: range,
-    config: GroundConfig,
-    may_be_ground: np.ndarray | None = None,
-) -> np.ndarray:
-    """How low a point may be to be ground: where others near by are about as low.
-
-    Args:
-      z: (n,) m.
-      xy: (n, 2) m.
-      halves_m: (2,) m: the squares cover |x| and |y| below these.
-      levels: which levels of .1 m there are; lower and higher points are in the first and the last.
-      config: the least share, and the least number, of the points in 3 x 3 squares.
-      may_be_ground: (rows, columns, levels) bool; None for all.
-
-    Returns:
-      (n,) m: minus infinity where the lowest level has support, infinity where none has.
-    """
-    rows, columns = np.ceil(2 * halves_m / SUPPORT_SQUARE_M).astype(int)
-    square = np.floor((xy + halves_m) / SUPPORT_SQUARE_M).astype(int).clip(0, (rows - 1, columns - 1))
-    level = np.floor(z * SUPPORT_LEVELS_PER_M).astype(int).clip(levels.start, levels.stop - 1) - levels.start
-    count = np.zeros((rows, columns, len(levels)))
-    np.add.at(count, (*square.T, level), 1)
-    count = ndimage.convolve(count, np.ones((3, 3, 1)), mode="constant")
-
-    def up_to(num: int) -> np.ndarray:
-        """Sums over each level and the ones above it, this many in all."""
-        padded = np.pad(count, ((0, 0), (0, 0), (0, num - 1)))
-        return np.lib.stride_tricks.sliding_window_view(padded, num, axis=2).sum(axis=-1)
-
-    needed = np.maximum(config.min_support_share * up_to(SUPPORT_LEVELS), config.min_support_points)
-    supported = up_to(2) >= needed
-    if may_be_ground is not None:
-        supported &= may_be_ground
-    least = np.array(levels) / SUPPORT_LEVELS_PER_M
-    least[0] = -np.inf
-    lowest = np.where(supported.any(axis=2), least[supported.argmax(axis=2)], np.inf)
-    return lowest[tuple(square.T)]
-
-
-def levels_with_area(lowest: np.ndarray, half_m: float, config: GroundConfig) -> np.ndarray:
-    """Which levels about the plane may be ground: deep ones that are lowest in enough cells.
-
-    Args:
-      lowest: (n, n) m above the plane, infinite where a cell is empty.
-      half_m: the cells cover |x| and |y| below this.
-      config: in two levels deep below the plane `min_deep_ratio` cells are asked for each cell in the fullest
-        two at the plane.
-
-    Returns:
-      (rows, columns, levels) bool, of 3 x 3 squares.
-    """
-    num_squares = int(np.ceil(2 * half_m / SUPPORT_SQUARE_M))
-    row, column = np.nonzero(np.isfinite(lowest))
-    cell_m = 2 * half_m / len(lowest)
-    square = np.floor((np.stack([row, column]) + 0.5) * cell_m / SUPPORT_SQUARE_M).astype(int)
-    level = np.floor(lowest[row, column] * SUPPORT_LEVELS_PER_M).astype(int)
-    level = level.clip(PLANE_LEVELS.start, PLANE_LEVELS.stop - 1) - PLANE_LEVELS.start
-    count = np.zeros((num_squares, num_squares, len(PLANE_LEVELS) + 1))
-    np.add.at(count, (*square, level), 1)
-    count = ndimage.convolve(count, np.ones((3, 3, 1)), mode="constant")
-    pairs = count[..., :-1] + count[..., 1:]
-    levels = np.array(PLANE_LEVELS)
-    is_at_plane = (levels >= -AT_PLANE_LEVELS) & (levels < AT_PLANE_LEVELS - 1)
-    needed = config.min_deep_ratio * pairs[..., is_at_plane].max(axis=2, keepdims=True)
-    return (levels >= -AT_PLANE_LEVELS) | (pairs >= needed)
 
 
 def spread_points(xyz: np.ndarray, inlier: np.ndarray, config: GroundConfig) -> np.ndarray:

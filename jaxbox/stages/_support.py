@@ -14,16 +14,20 @@ SUPPORT_SQUARE_M = 2.0
 """Edge of the squares in which points support each other as ground."""
 
 
-SUPPORT_LEVELS_PER_M, SUPPORT_LEVELS = 10.0, 12
-"""Heights are compared in levels of .1 m, and a level with so many from it on."""
+SUPPORT_LEVELS_PER_M, SUPPORT_LEVELS = 20, 24
+"""Points are compared in levels of .05 m, and a level with so many from it on."""
 
 
-SENSOR_LEVELS, PLANE_LEVELS = range(-100, 28), range(-13, 11)
-"""Levels about the sensor, in which the ground is sought, and about the plane."""
+SENSOR_LEVELS, PLANE_LEVELS = range(-200, 56), range(-26, 22)
+"""Such levels about the sensor, in which the ground is sought, and about the plane."""
+
+
+AREA_LEVELS_PER_M, AREA_LEVELS = 10, range(-13, 11)
+"""Cells are compared in levels of .1 m about the plane."""
 
 
 AT_PLANE_LEVELS = 3
-"""What is within so many levels of the plane lies at its height; what is lower lies deep below it."""
+"""What is within so many of these of the plane lies at its height; what is lower lies deep below it."""
 
 
 def least_supported(
@@ -40,6 +44,7 @@ def least_supported(
     Returns from below the road (a beam that a puddle or glass reflects goes on past the road) are few and
     spread in height, the road's are many and close together. In each square with the eight round it, the
     lowest level is sought that holds, together with the next, enough of the points up to 1.2 m above it.
+    Levels are thin, since the one just below the road has the road's own support.
 
     Args:
       z: (N,) float32, m.
@@ -48,7 +53,8 @@ def least_supported(
       halves_m: the squares cover |x| and |y| below these.
       levels: which levels there are; lower and higher points are in the first and the last.
       config: the least share of those points, and their least number.
-      may_be_ground: (L, cells) bool, see `levels_with_area`; None for all.
+      may_be_ground: (A, cells) bool, see `levels_with_area`, which levels half as many as `levels` make;
+        None for all.
 
     Returns:
       (N,) float32, m: minus infinity where the lowest level has support, infinity where none has.
@@ -69,10 +75,12 @@ def least_supported(
     )
     two = count[:-1] + count[1:]
     four = two[:-2] + two[2:]
-    twelve = four[:-8] + four[4:-4] + four[8:]
-    supported = two[:num_levels] >= jnp.maximum(config.min_support_share * twelve, config.min_support_points)
+    eight = four[:-4] + four[4:]
+    all_above = eight[:-16] + eight[8:-8] + eight[16:]
+    needed = jnp.maximum(config.min_support_share * all_above, config.min_support_points)
+    supported = two[:num_levels] >= needed
     if may_be_ground is not None:
-        supported &= may_be_ground
+        supported &= jnp.repeat(may_be_ground, num_levels // len(may_be_ground), axis=0)
     least = np.array(levels, np.float32) / np.float32(SUPPORT_LEVELS_PER_M)
     least[0] = -np.inf
     return lookup(jnp.min(jnp.where(supported, least[:, None], jnp.inf), axis=0), square)
@@ -87,24 +95,27 @@ def levels_with_area(lowest: jax.Array, half_m: float, config: GroundConfig) -> 
     .2 m. Where the ground is lower than the plane, things on it reach the plane's height, but are lowest in
     few cells there.
 
+    The plane may lie below the road, and a few returns from below the road at the plane. So what lies at the
+    plane has to be lowest in a share of the cells that any .2 m of heights above it has.
+
     Args:
       lowest: (n, n) float32, m above the plane: the lowest point of each cell, infinite where it is empty.
       half_m: the cells cover |x| and |y| below this.
-      config: the share of cells.
+      config: the shares of cells.
 
     Returns:
-      (L, cells) bool for `PLANE_LEVELS`, see `margin_cells`; of cells of the margin anything.
+      (A, cells) bool for `AREA_LEVELS`, see `margin_cells`; of cells of the margin anything.
 
     Reference: oracle `jaxbox.reference.levels_with_area`.
     """
-    n, num_levels, plane_row = lowest.shape[0], len(PLANE_LEVELS), -PLANE_LEVELS.start
+    n, num_levels, plane_row = lowest.shape[0], len(AREA_LEVELS), -AREA_LEVELS.start
     shape = _num_squares(half_m), _num_squares(half_m)
     middle_m = (np.arange(n) + 0.5) * (2 * half_m / n)
     line = jnp.array(np.floor(middle_m / SUPPORT_SQUARE_M), jnp.int32)
     square = margin_cells(line[:, None], line[None], shape)
     is_occupied = jnp.isfinite(lowest)
-    level = jnp.floor(jnp.where(is_occupied, lowest, 0) * SUPPORT_LEVELS_PER_M).astype(jnp.int32) + plane_row
-    level = jnp.clip(level, 0, num_levels - 1)
+    level = jnp.floor(jnp.where(is_occupied, lowest, 0) * AREA_LEVELS_PER_M).astype(jnp.int32)
+    level = jnp.clip(level + plane_row, 0, num_levels - 1)
     count = window_counts(
         level.reshape(-1),
         square.reshape(-1),
@@ -114,9 +125,16 @@ def levels_with_area(lowest: jax.Array, half_m: float, config: GroundConfig) -> 
         shape=shape,
     )
     two = count[:-1] + count[1:]
-    near = two[plane_row - AT_PLANE_LEVELS : plane_row + AT_PLANE_LEVELS - 1]
-    is_at_plane_or_above = jnp.array(np.array(PLANE_LEVELS)[:, None] >= -AT_PLANE_LEVELS)
-    return is_at_plane_or_above | (two >= config.min_deep_ratio * jnp.max(near, axis=0, keepdims=True))
+    at_plane = range(plane_row - AT_PLANE_LEVELS, plane_row + AT_PLANE_LEVELS - 1)
+
+    def fullest_from(row: int) -> jax.Array:
+        return jnp.max(two[row : at_plane.stop], axis=0)
+
+    deep = config.min_deep_ratio * fullest_from(at_plane.start)
+    low = [config.min_low_ratio * fullest_from(row + 2) for row in at_plane[:-2]]
+    needed = jnp.stack([deep] * at_plane.start + low)
+    high = jnp.ones((num_levels - len(needed), two.shape[1]), bool)
+    return jnp.concatenate([two[: len(needed)] >= needed, high])
 
 
 def _num_squares(half_m: float) -> int:
