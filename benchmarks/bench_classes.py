@@ -1,6 +1,7 @@
 """What is found of cars, vans and trucks on KITTI's object benchmark, and how many boxes of each are right.
 
     python -m benchmarks.bench_classes --json benchmarks/results/classes.json
+    python -m benchmarks.bench_classes --corrupt reflections --amount 0.01    # of the points below the road
 
 The 78 frames of both sets, as recorded, turned and mirrored; they chose what vans and trucks are, so these
 are figures of a tuning set. A label is *found* where a box of any class, from
@@ -9,6 +10,8 @@ shows that box or not. Of the boxes that it shows, as KITTI's text has them, tho
 any label by .3, as labels go no farther than the image; *false* ones overlap none by .1. Others that lie for
 more than half in a DontCare region do not count, as nobody labelled what is there. From the *cuts* on nine
 of ten, and 19 of 20, boxes of the class are right. The last row has cars, vans and trucks as one class.
+Of corrupted sweeps, see `bench_corruption`, labels have the points of the clean ones; each copy is corrupted
+with a seed of its own.
 """
 
 import argparse
@@ -18,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import common
+from benchmarks.bench_corruption import corrupt, seeded
 from jaxbox import DEFAULT_SCORE_THRESHOLD, DetectorConfig, Label
 from jaxbox.evaluation import pairwise_overlaps
 from jaxbox.evaluation.boxes import excused_in_image
@@ -30,6 +34,7 @@ from jaxbox.evaluation.copies import (
     turn_back,
     turn_points,
 )
+from jaxbox.evaluation.corruptions import CORRUPTIONS
 from jaxbox.io import KittiObject, boxes_from_objects, objects_from_detections, open_sweeps
 from jaxbox.types import Calibration
 
@@ -129,22 +134,36 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Prints the table, and writes the report."""
     parser = common.parser(__doc__ or "", quick="four frames, as recorded")
     parser.add_argument("--copies", type=int, default=len(COPIES), choices=range(1, len(COPIES) + 1))
+    of_points = sorted(name for name, kind in CORRUPTIONS.items() if kind.of_points is not None)
+    parser.add_argument("--corrupt", choices=of_points, help="make the sweeps worse, by --amount")
+    parser.add_argument("--amount", type=float, help="how much, in the unit of the corruption")
     options: argparse.Namespace = parser.parse_args(arguments)
+    if (options.corrupt is None) != (options.amount is None):
+        parser.error("--corrupt asks for --amount, and --amount for --corrupt")
     config = common.chosen_config(options)
     frames = labelled_frames(sweep for name in FRAMES for sweep in open_sweeps(common.data_folder(name)))
     frames = frames[:: len(frames) // 4] if options.quick else frames
     copies = COPIES[: 1 if options.quick else options.copies]
+    kind = None if options.corrupt is None else CORRUPTIONS[options.corrupt]
     measured = []
     for frame in frames:
         num_points = label_points(frame)
-        measured += [measure(frame, copy, num_points, config) for copy in copies]
+        for copy in copies:
+            seen = frame
+            if kind is not None:
+                rng = seeded(frame.name, copy.name, options.corrupt, options.amount)
+                seen = corrupt(frame, kind, options.amount, rng)
+            measured.append(measure(seen, copy, num_points, config))
     table = summarise(measured)
     columns = list(next(iter(table.values())))
     common.print_table(["class", *columns], [[kind, *row.values()] for kind, row in table.items()])
     print(
         f"{len(frames)} frames, {len(copies)} copies; cut 0.9: from there on that share of the boxes is right"
     )
-    common.write_report({"num_frames": len(frames), "num_copies": len(copies), "classes": table}, options)
+    report = {"num_frames": len(frames), "num_copies": len(copies), "classes": table}
+    if kind is not None:
+        report |= {"corruption": options.corrupt, "amount": options.amount}
+    common.write_report(report, options)
 
 
 if __name__ == "__main__":

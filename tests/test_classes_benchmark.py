@@ -76,6 +76,23 @@ def test_what_lies_for_more_than_half_in_a_region_is_in_it():
     assert in_regions([], regions).shape == (0,)
 
 
+@pytest.mark.parametrize("arguments", [["--corrupt", "reflections"], ["--amount", "0.01"]])
+def test_a_corruption_needs_its_amount(arguments, capsys):
+    with pytest.raises(SystemExit):
+        bench.main(arguments)
+    assert "--amount" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("kind", ["reflections", "mirrored"])
+def test_a_hundredth_of_points_below_the_road_costs_hardly_a_well_seen_car(kind):
+    report = json.loads((RESULTS / f"classes_{kind}.json").read_text())
+    assert (report["corruption"], report["amount"], report["num_copies"]) == (kind, 0.01, 6)
+    clean = json.loads((RESULTS / "classes.json").read_text())["classes"]["Car"]
+    car = report["classes"]["Car"]
+    assert car["labels 100"] == clean["labels 100"]
+    assert car["found 100"] >= clean["found 100"] - 0.01 * clean["labels 100"]
+
+
 def test_the_record_is_of_all_frames_and_copies():
     report = json.loads((RESULTS / "classes.json").read_text())
     assert (report["num_frames"], report["num_copies"]) == (78, 6)
