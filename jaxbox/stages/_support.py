@@ -53,8 +53,7 @@ def least_supported(
       halves_m: the squares cover |x| and |y| below these.
       levels: which levels there are; lower and higher points are in the first and the last.
       config: the least share of those points, and their least number.
-      may_be_ground: (A, cells) bool, see `levels_with_area`, which levels half as many as `levels` make;
-        None for all.
+      may_be_ground: (A, cells) bool, of levels twice as thick, see `levels_with_area`; None for all.
 
     Returns:
       (N,) float32, m: minus infinity where the lowest level has support, infinity where none has.
