@@ -89,30 +89,37 @@ def test_levels_deep_below_the_plane_have_the_area_that_the_reference_asks_for(c
     assert np.mean(np.concatenate(of_strays)) < 0.95
 
 
-@pytest.mark.parametrize("ratio", [0.625, 1.5])
+@pytest.mark.parametrize("ratio", [GROUND.min_low_ratio, 1.5])
 def test_levels_at_the_plane_have_the_area_that_the_reference_asks_for(cases, ratio):
     config = dataclasses.replace(GROUND, min_low_ratio=ratio)
-    num_squares, at_plane = 80, slice(10, 13)
-    denied = []
+    num_squares, of_road, of_strays = 80, [], []
     for case in cases:
         lowest = np.full((320, 320), np.inf, np.float32)
         cell = np.floor((case.xyz[:, :2] + 80) / 0.5).astype(int).clip(0, 319)
-        # As if the plane lay .1 m below the road.
-        np.minimum.at(lowest, tuple(cell.T), case.height + np.float32(0.1))
+        # As if the plane lay .15 m below the road, and one in 100 points .3 m.
+        is_stray = np.random.default_rng(0).random(len(cell)) < 0.01
+        height = case.height + np.where(is_stray, -0.15, 0.15).astype(np.float32)
+        np.minimum.at(lowest, tuple(cell.T), height)
         expected = reference.levels_with_area(lowest, 80.0, config)
         levels = np.asarray(levels_with_area(lowest, 80.0, config))
         levels = levels.reshape(-1, num_squares + 1, num_squares + 1)[:, :num_squares, :num_squares]
-        differ = np.moveaxis(levels, 0, 2)[..., at_plane] != expected[..., at_plane]
-        parity.assert_share(np.sum(differ), differ.size, 3e-4, "levels")
-        denied.append(1 - expected[..., at_plane].mean(axis=(0, 1)))
-    # The level that holds the road is among few of these.
-    assert np.all(np.mean(denied, axis=0)[:2] > 0.02), denied
+        # A height on the border of a level may round into either.
+        parity.assert_share(np.sum(np.moveaxis(levels, 0, 2) != expected), expected.size, 1e-4, "levels")
+        row, column = np.nonzero(np.isfinite(lowest))
+        level = np.floor(10 * lowest[row, column]).astype(int).clip(-13, 10)
+        may_be_ground = expected[row // 4, column // 4, level + 13]
+        # Farther away the real ground lies as much lower.
+        is_near = np.hypot(row - 160, column - 160) < 40
+        of_road.append(may_be_ground[is_near & (level == 1)])
+        of_strays.append(may_be_ground[is_near & (level >= -3) & (level < 0)])
+    assert np.mean(np.concatenate(of_road)) > 0.9
+    assert np.mean(np.concatenate(of_strays)) < 0.5
 
 
 def test_few_returns_below_the_road_do_not_move_the_ground():
     sweep = synthetic.make_sweep(5, num_azimuths=1000)
-    # Support alone: that deep levels are lowest in few cells would do, too.
-    config = dataclasses.replace(GROUND, min_deep_ratio=0.0)
+    # Support alone: that low levels are lowest in few cells would do, too.
+    config = dataclasses.replace(GROUND, min_deep_ratio=0.0, min_low_ratio=0.0)
     far = np.hypot(*sweep.xyz[:, :2].T) > 3
     mask, plane = far, np.array([[0, 0, -SENSOR_HEIGHT_M]], np.float32)
     xyz, _ = reflect_below_road(sweep.xyz, sweep.intensity, 0.01, np.random.default_rng(0))
@@ -157,7 +164,8 @@ def test_returns_at_a_plane_below_the_road_do_not_move_the_ground_below_cars(see
             for points in (sweep.xyz, xyz)
         )
         error_m[ratio] = np.abs(below - clean).mean()
-    assert error_m[GROUND.min_low_ratio] < 0.01 < 0.012 < error_m[0.0], error_m
+    assert 3 * error_m[GROUND.min_low_ratio] < error_m[0.0], error_m
+    assert error_m[GROUND.min_low_ratio] < 0.01, error_m
 
 
 @pytest.mark.parametrize("seed", [5, 6])

@@ -130,8 +130,9 @@ class GroundConfig:
     many cells within 3 m for each cell in the fullest .2 m at the plane; what has fewer is a mirror image in
     a wet road. 0 asks for none."""
     min_low_ratio: Scalar = 0.625
-    """Nearer to the plane .2 m of heights are ground only where they hold the lowest point of so many cells
-    within 3 m for each cell in any .2 m above them; what has fewer lies below the road. 0 asks for none."""
+    """From .3 m below the plane to .1 m above it .2 m of heights are ground only where they hold the lowest
+    point of so many cells within 3 m for each cell in the fullest .2 m above them (up to .3 m above the
+    plane); what has fewer lies below the road. 0 asks for none."""
     smoothing_m: Scalar = 1.0
     """Standard deviation of the Gaussian that smooths the ground grid (and fills it, 4 x wider)."""
     min_height_m: Scalar = 0.2

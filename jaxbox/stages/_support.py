@@ -95,7 +95,8 @@ def levels_with_area(lowest: jax.Array, half_m: float, config: GroundConfig) -> 
     few cells there.
 
     The plane may lie below the road, and a few returns from below the road at the plane. So what lies at the
-    plane has to be lowest in a share of the cells that any .2 m of heights above it has.
+    plane has to be lowest in a share of the cells that the fullest .2 m above it has, up to .3 m above the
+    plane.
 
     Args:
       lowest: (n, n) float32, m above the plane: the lowest point of each cell, infinite where it is empty.
