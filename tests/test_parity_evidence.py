@@ -245,10 +245,13 @@ def test_completed_boxes_are_those_of_the_reference(cases, number):
     # A ray that ends otherwise moves J by a step of 1 / 32, and by the length that it had free.
     parity.assert_share(np.sum(gap > 1e-4), len(gap), 0.005, f"J of boxes completed {number}")
     parity.assert_within(gap, 0.3, f"J of boxes completed {number}")
-    # Rays come in thirty-seconds, so that two hypotheses may be worth the same: either may be chosen.
+    # Rays come in thirty-seconds, so that two hypotheses may be worth the same: either may be chosen. Nearly
+    # always these are the two that have the length along either side.
     other = np.max(np.abs(ours - theirs)[:, :-1], axis=1) > 1e-4
     parity.assert_share(np.sum(other & (gap > 1e-5)), len(other), 0.005, f"boxes completed {number}")
-    parity.assert_share(other.sum(), len(other), 0.04, f"boxes completed {number}, ties among them")
+    across = np.abs(np.sin(ours[:, 4] - theirs[:, 4])) > 0.99
+    parity.assert_share(np.sum(other & ~across), len(other), 0.01, f"boxes completed {number}, elsewhere")
+    parity.assert_share(other.sum(), len(other), 0.05, f"boxes completed {number}, ties among them")
 
 
 @pytest.mark.parametrize("mode", ["away", "none"])
