@@ -66,23 +66,30 @@ def test_ground_has_the_support_that_the_reference_asks_for(cases, changes, leve
         np.testing.assert_allclose(np.asarray(least)[: len(xyz)], expected, atol=1e-6)
 
 
+def judged_cells(lowest, config):
+    """Row, column and level of the cells that are not empty, and whether the reference, and jaxbox with it,
+    takes their level for ground."""
+    num_squares = 80
+    expected = reference.levels_with_area(lowest, 80.0, config)
+    levels = np.asarray(levels_with_area(lowest, 80.0, config))
+    levels = levels.reshape(-1, num_squares + 1, num_squares + 1)[:, :num_squares, :num_squares]
+    # A height on the border of a level may round into either.
+    parity.assert_share(np.sum(np.moveaxis(levels, 0, 2) != expected), expected.size, 1e-4, "levels")
+    row, column = np.nonzero(np.isfinite(lowest))
+    level = np.floor(10 * lowest[row, column]).astype(int).clip(-13, 10)
+    return row, column, level, expected[row // 4, column // 4, level + 13]
+
+
 @pytest.mark.parametrize("share", [1.0, 3.0])
 def test_levels_deep_below_the_plane_have_the_area_that_the_reference_asks_for(cases, share):
     config = dataclasses.replace(GROUND, min_deep_ratio=share)
-    num_squares, of_road, of_strays = 80, [], []
+    of_road, of_strays = [], []
     for case in cases:
         lowest = np.full((320, 320), np.inf, np.float32)
         cell = np.floor((case.xyz[:, :2] + 80) / 0.5).astype(int).clip(0, 319)
         # As if the plane lay .5 m above the road.
         np.minimum.at(lowest, tuple(cell.T), case.height - np.float32(0.5))
-        expected = reference.levels_with_area(lowest, 80.0, config)
-        levels = np.asarray(levels_with_area(lowest, 80.0, config))
-        levels = levels.reshape(-1, num_squares + 1, num_squares + 1)[:, :num_squares, :num_squares]
-        # A height on the border of a level may round into either.
-        parity.assert_share(np.sum(np.moveaxis(levels, 0, 2) != expected), expected.size, 1e-4, "levels")
-        row, column = np.nonzero(np.isfinite(lowest))
-        level = np.floor(10 * lowest[row, column]).astype(int).clip(-13, 10)
-        may_be_ground = expected[row // 4, column // 4, level + 13]
+        _, _, level, may_be_ground = judged_cells(lowest, config)
         of_road.append(may_be_ground[(level == -6) | (level == -5)])
         of_strays.append(may_be_ground[level < -8])
     assert np.mean(np.concatenate(of_road)) > 0.9
@@ -92,7 +99,7 @@ def test_levels_deep_below_the_plane_have_the_area_that_the_reference_asks_for(c
 @pytest.mark.parametrize("ratio", [GROUND.min_low_ratio, 1.5])
 def test_levels_at_the_plane_have_the_area_that_the_reference_asks_for(cases, ratio):
     config = dataclasses.replace(GROUND, min_low_ratio=ratio)
-    num_squares, of_road, of_strays = 80, [], []
+    of_road, of_strays = [], []
     for case in cases:
         lowest = np.full((320, 320), np.inf, np.float32)
         cell = np.floor((case.xyz[:, :2] + 80) / 0.5).astype(int).clip(0, 319)
@@ -100,14 +107,7 @@ def test_levels_at_the_plane_have_the_area_that_the_reference_asks_for(cases, ra
         is_stray = np.random.default_rng(0).random(len(cell)) < 0.01
         height = case.height + np.where(is_stray, -0.15, 0.15).astype(np.float32)
         np.minimum.at(lowest, tuple(cell.T), height)
-        expected = reference.levels_with_area(lowest, 80.0, config)
-        levels = np.asarray(levels_with_area(lowest, 80.0, config))
-        levels = levels.reshape(-1, num_squares + 1, num_squares + 1)[:, :num_squares, :num_squares]
-        # A height on the border of a level may round into either.
-        parity.assert_share(np.sum(np.moveaxis(levels, 0, 2) != expected), expected.size, 1e-4, "levels")
-        row, column = np.nonzero(np.isfinite(lowest))
-        level = np.floor(10 * lowest[row, column]).astype(int).clip(-13, 10)
-        may_be_ground = expected[row // 4, column // 4, level + 13]
+        row, column, level, may_be_ground = judged_cells(lowest, config)
         # Farther away the real ground lies as much lower.
         is_near = np.hypot(row - 160, column - 160) < 40
         of_road.append(may_be_ground[is_near & (level == 1)])
