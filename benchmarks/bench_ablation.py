@@ -67,6 +67,7 @@ ABLATIONS = (
     Ablation("ground needs no support", {"ground.min_support_share": 0.0}),
     Ablation("mirror images may be ground", {"ground.min_deep_ratio": 0.0}),
     Ablation("few low cells may be ground", {"ground.min_low_ratio": 0.0}),
+    Ablation("pits may be ground", {"ground.min_pit_neighbours": 9.0}),
     Ablation("smooth sheets are no ground", {"ground.sheet_tolerance_m": 0.0}),
     # Proposals.
     Ablation("one map: 0.2 m", _without_maps(1, 2)),

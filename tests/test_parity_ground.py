@@ -24,6 +24,7 @@ on_sheets = jax.jit(_sheets.on_sheets)
 planes_through_windows = jax.jit(_sheets.planes_through_windows)
 least_supported = jax.jit(_support.least_supported, static_argnums=(3, 4))
 levels_with_area = jax.jit(_support.levels_with_area, static_argnums=1)
+in_pits = jax.jit(_support.in_pits)
 height_above_ground = jax.jit(ground.height_above_ground)
 
 
@@ -118,8 +119,8 @@ def test_levels_at_the_plane_have_the_area_that_the_reference_asks_for(cases, ra
 
 def test_few_returns_below_the_road_do_not_move_the_ground():
     sweep = synthetic.make_sweep(5, num_azimuths=1000)
-    # Support alone: that low levels are lowest in few cells would do, too.
-    config = dataclasses.replace(GROUND, min_deep_ratio=0.0, min_low_ratio=0.0)
+    # Support alone: that low levels are lowest in few cells, or in pits, would do, too.
+    config = dataclasses.replace(GROUND, min_deep_ratio=0.0, min_low_ratio=0.0, min_pit_neighbours=9.0)
     far = np.hypot(*sweep.xyz[:, :2].T) > 3
     mask, plane = far, np.array([[0, 0, -SENSOR_HEIGHT_M]], np.float32)
     xyz, _ = reflect_below_road(sweep.xyz, sweep.intensity, 0.01, np.random.default_rng(0))
@@ -154,7 +155,7 @@ def test_returns_at_a_plane_below_the_road_do_not_move_the_ground_below_cars(see
     xyz, _ = reflect_below_road(sweep.xyz, sweep.intensity, 0.06, np.random.default_rng(0))
     error_m = {}
     for ratio in (0.0, GROUND.min_low_ratio):
-        config = dataclasses.replace(GROUND, min_low_ratio=ratio)
+        config = dataclasses.replace(GROUND, min_low_ratio=ratio, min_pit_neighbours=9.0)
         clean, below = (
             np.asarray(
                 ground.surface_height(
@@ -166,6 +167,53 @@ def test_returns_at_a_plane_below_the_road_do_not_move_the_ground_below_cars(see
         error_m[ratio] = np.abs(below - clean).mean()
     assert 3 * error_m[GROUND.min_low_ratio] < error_m[0.0], error_m
     assert error_m[GROUND.min_low_ratio] < 0.01, error_m
+
+
+def test_pits_are_those_of_the_reference(cases):
+    rng, num_pits = np.random.default_rng(0), 0
+    for case in cases:
+        lowest = np.full((320, 320), np.inf, np.float32)
+        cell = np.floor((case.xyz[:, :2] + 80) / 0.5).astype(int).clip(0, 319)
+        is_stray = rng.random(len(cell)) < 0.01
+        depth_m = rng.uniform(0.2, 0.8, len(cell))
+        np.minimum.at(lowest, tuple(cell.T), case.height - np.where(is_stray, depth_m, 0).astype(np.float32))
+        expected = reference.in_pits(lowest, GROUND)
+        np.testing.assert_array_equal(in_pits(lowest, GROUND), expected)
+        assert not expected[np.isinf(lowest)].any()
+        num_pits += expected.sum()
+    assert num_pits > 20 * len(cases)
+
+
+def test_single_low_cells_are_pits_and_trenches_hollows_and_the_road_beside_things_are_not():
+    rng = np.random.default_rng(1)
+    lowest = rng.uniform(-0.03, 0.03, (60, 60)).astype(np.float32)
+    single = np.zeros(lowest.shape, bool)
+    single[2:18:4, 2::4] = True
+    lowest[single] -= 0.25
+    lowest[20] -= 0.25
+    lowest[24:26, 10:12] -= 0.25
+    lowest[40:58] += 1
+    lowest[42:56:4, 2::4] -= 1
+    np.testing.assert_array_equal(in_pits(lowest, GROUND), single)
+    # With two neighbours nothing is known.
+    lowest[1:19][~single[1:19]] = np.inf
+    lowest[2:18:4, 3::4], lowest[2:18:4, 1::4] = 0, 0
+    assert not in_pits(lowest, GROUND).any()
+
+
+def test_single_low_cells_do_not_move_the_ground():
+    rng = np.random.default_rng(2)
+    road = np.column_stack([rng.uniform(-20, 20, (40_000, 2)), rng.normal(-1.7, 0.01, 40_000)])
+    # Five points in the middle of one cell in twelve support each other.
+    middle = np.mgrid[-19.75:20, -19.75:20].reshape(2, -1).T[::3]
+    low = np.repeat(np.pad(middle, ((0, 0), (0, 1)), constant_values=-1.95), 5, axis=0)
+    xyz, plane = np.concatenate([road, low]).astype(np.float32), np.array([[0, 0, -1.7]], np.float32)
+    error_m = {}
+    for num in (9.0, GROUND.min_pit_neighbours):
+        config = dataclasses.replace(GROUND, min_support_share=0, min_low_ratio=0, min_pit_neighbours=num)
+        surface = fit_ground_surface(xyz, np.ones(len(xyz), bool), plane, config)
+        error_m[num] = np.abs(np.asarray(surface))[62:98, 62:98].mean()
+    assert error_m[GROUND.min_pit_neighbours] < 0.03 < 0.1 < error_m[9.0], error_m
 
 
 @pytest.mark.parametrize("seed", [5, 6])

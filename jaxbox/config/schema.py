@@ -133,6 +133,9 @@ class GroundConfig:
     """From .3 m below the plane to .1 m above it .2 m of heights are ground only where they hold the lowest
     point of so many cells within 3 m for each cell in the fullest .2 m above them (up to .3 m above the
     plane); what has fewer lies below the road. 0 asks for none."""
+    min_pit_neighbours: Scalar = 3.0
+    """A cell lower than all eight round it by ``envelope_margin_m`` is no ground where so many of them are up
+    to .5 m higher: a return from below the road, alone. 9 takes out none."""
     smoothing_m: Scalar = 1.0
     """Standard deviation of the Gaussian that smooths the ground grid (and fills it, 4 x wider)."""
     min_height_m: Scalar = 0.2

@@ -160,7 +160,7 @@ from jaxbox.reference.state import (
     ShapeDescriptors,
     Sweep,
 )
-from jaxbox.reference.support import least_supported, levels_with_area
+from jaxbox.reference.support import in_pits, least_supported, levels_with_area
 from jaxbox.reference.surroundings import (
     cluster_alone,
     count_points_around,
@@ -262,6 +262,7 @@ __all__ = [
     "height_above_ground",
     "height_above_planes",
     "hit_share",
+    "in_pits",
     "index_obstacles",
     "is_behind",
     "is_large",

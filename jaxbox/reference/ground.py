@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 from jaxbox.config import DetectorConfig, GroundConfig
 from jaxbox.config.schema import GROUND_CANDIDATE_CELL_M
 from jaxbox.reference.state import Ground, Obstacles, Sweep
-from jaxbox.reference.support import PLANE_LEVELS, SENSOR_LEVELS, least_supported, levels_with_area
+from jaxbox.reference.support import PLANE_LEVELS, SENSOR_LEVELS, in_pits, least_supported, levels_with_area
 
 DIAGONAL_STEP = np.sqrt(2)
 """Diagonal neighbours are this many cells away."""
@@ -272,6 +272,7 @@ def fit_ground_surface(xyz: np.ndarray, planes: np.ndarray, config: GroundConfig
     ground[in_band] = deviation[in_band] >= least
     lowest = np.full((num_cells, num_cells), np.inf)
     np.minimum.at(lowest, tuple(index[ground].T), deviation[ground])
+    lowest[in_pits(lowest, config)] = np.inf
     step = float(config.max_grade * cell_m)
     middle = (np.arange(num_cells) + 0.5) * cell_m - half_m
     band_m = config.band_above_m + config.band_above_grade * np.hypot(*np.meshgrid(middle, middle))

@@ -17,6 +17,8 @@ AREA_LEVELS_PER_M, AREA_LEVELS = 10, range(-13, 11)
 """Cells are compared in levels of .1 m about the plane."""
 AT_PLANE_LEVELS = 3
 """What is within so many of these of the plane lies at its height; what is lower lies deep below it."""
+PIT_DEPTH_M = 0.5
+"""What is higher than a cell by more than this is a thing beside it, no road round a pit."""
 
 
 def least_supported(
@@ -96,3 +98,21 @@ def levels_with_area(lowest: np.ndarray, half_m: float, config: GroundConfig) ->
     above = np.pad(above, ((0, 0), (0, 0), (0, 2)))
     deep = at_plane.max(axis=2, keepdims=True)
     return pairs >= np.where(is_deep, config.min_deep_ratio * deep, config.min_low_ratio * above)
+
+
+def in_pits(lowest: np.ndarray, config: GroundConfig) -> np.ndarray:
+    """Cells that lie alone below the road: lower than all their neighbours, of which several are near.
+
+    Args:
+      lowest: (X, Y) m above the plane, infinite where a cell is empty.
+      config: lower by `envelope_margin_m`, and `min_pit_neighbours` up to .5 m higher.
+
+    Returns:
+      (X, Y) bool.
+    """
+    padded = np.pad(lowest, 1, constant_values=np.inf)
+    window = np.lib.stride_tricks.sliding_window_view(padded, (3, 3)).reshape(*lowest.shape, 9)
+    neighbours = np.delete(window, 4, axis=2)
+    is_lowest = neighbours.min(axis=2) >= lowest + config.envelope_margin_m
+    num_near = (neighbours < lowest[..., None] + PIT_DEPTH_M).sum(axis=2)
+    return is_lowest & (num_near >= config.min_pit_neighbours)

@@ -1,5 +1,6 @@
 """Which of the lowest returns others support as ground: what lies below the road is a reflection in it."""
 
+import functools
 import math
 
 import jax
@@ -28,6 +29,10 @@ AREA_LEVELS_PER_M, AREA_LEVELS = 10, range(-13, 11)
 
 AT_PLANE_LEVELS = 3
 """What is within so many of these of the plane lies at its height; what is lower lies deep below it."""
+
+
+PIT_DEPTH_M = 0.5
+"""What is higher than a cell by more than this is a thing beside it, no road round a pit."""
 
 
 def least_supported(
@@ -135,6 +140,33 @@ def levels_with_area(lowest: jax.Array, half_m: float, config: GroundConfig) -> 
     needed = jnp.stack([deep] * at_plane.start + low)
     high = jnp.ones((num_levels - len(needed), two.shape[1]), bool)
     return jnp.concatenate([two[: len(needed)] >= needed, high])
+
+
+def in_pits(lowest: jax.Array, config: GroundConfig) -> jax.Array:
+    """Cells that lie alone below the road: lower than all their neighbours, of which several are near.
+
+    A few returns from below the road pass as support of each other where the road is lower some metres
+    away. A cell of the road has another next to it at its height; or things there, which are higher.
+
+    Args:
+      lowest: (n, n) float32, m above the plane: the lowest point of each cell, infinite where it is empty.
+      config: by how much lower, and the least number of neighbours up to `PIT_DEPTH_M` higher.
+
+    Returns:
+      (n, n) bool.
+
+    Reference: oracle `jaxbox.reference.in_pits`.
+    """
+    n = lowest.shape[0]
+    padded = jnp.pad(lowest, 1, constant_values=jnp.inf)
+    offsets = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+    neighbours = [padded[i : i + n, j : j + n] for i, j in offsets]
+
+    def num_below(height: jax.Array) -> jax.Array:
+        return functools.reduce(jnp.add, [(each < height).astype(jnp.float32) for each in neighbours])
+
+    is_lowest = num_below(lowest + config.envelope_margin_m) == 0
+    return is_lowest & (num_below(lowest + PIT_DEPTH_M) >= config.min_pit_neighbours)
 
 
 def _num_squares(half_m: float) -> int:

@@ -13,7 +13,7 @@ from jaxbox.config.capacities import obstacle_capacity
 from jaxbox.config.schema import GROUND_CANDIDATE_CELL_M
 from jaxbox.geometry.planar import plane_residual
 from jaxbox.stages._sheets import on_sheets
-from jaxbox.stages._support import PLANE_LEVELS, SENSOR_LEVELS, least_supported, levels_with_area
+from jaxbox.stages._support import PLANE_LEVELS, SENSOR_LEVELS, in_pits, least_supported, levels_with_area
 from jaxbox.stages.state import Ground, Obstacles, Sweep
 from jaxbox.types import GroundPlane
 from jaxbox.xla import chunks
@@ -318,6 +318,7 @@ def fit_ground_surface(xyz: jax.Array, mask: jax.Array, planes: jax.Array, confi
     may_be_sheet = above_band & (height < config.band_above_m + config.sheet_band_grade * rho)
     may_be_ground = counted & ((in_band & (height >= least)) | may_be_sheet)
     lowest = segment_minima(height, i * n + j, may_be_ground, num_segments=n * n).reshape(n, n)
+    lowest = jnp.where(in_pits(lowest, config), jnp.inf, lowest)
     middle = jnp.arange(n, dtype=jnp.float32) * cell_m + (cell_m / 2 - half_m)
     rho = jnp.sqrt(middle[:, None] ** 2 + middle[None] ** 2)
     low = jnp.where(lowest < config.band_above_m + config.band_above_grade * rho, lowest, jnp.inf)
