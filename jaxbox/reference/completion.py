@@ -183,9 +183,9 @@ def complete_box(
 
     "evidence" tries each side of each rectangle as the length, extended away from the sensor, with the
     width extended away from it, towards it, or both ways, and takes the largest objective (see
-    `choose_placement`), blended with others (see `blend_boxes`). Boxes are judged at the class's size, and
-    answered at their likely size (see `likely_sizes`). "away" takes the longer side of the first rectangle as
-    the length and extends both away; "none" changes nothing.
+    `placement_objectives`), blended with others (see `blend_boxes`). Boxes are judged at the class's size,
+    and answered at their likely size (see `likely_sizes`). "away" takes the longer side of the first
+    rectangle as the length and extends both away; "none" changes nothing.
 
     Args:
       xy: (n, 2) m, sensor frame: the fitted points.
@@ -202,7 +202,34 @@ def complete_box(
         sides = longer_side(rectangles[0])
         return keep_measured(sides, prior) if config.mode == "none" else extend_away(sides, prior, config)
     assert evidence is not None
-    boxes: list[CompletedBox] = []
+    assignments = complete_assignments(xy, rectangles, prior, evidence, config, in_row=in_row)
+    boxes = [max(placed, key=lambda box: box.objective) for placed in assignments]
+    return blend_boxes(boxes, max_loss=config.blend_objective) if boxes else None
+
+
+def complete_assignments(
+    xy: np.ndarray,
+    rectangles: Sequence[Rectangle],
+    prior: ClassPrior,
+    evidence: Evidence,
+    config: CompletionConfig,
+    *,
+    in_row: Collection[tuple[int, int]] = (),
+) -> list[list[CompletedBox]]:
+    """What `complete_box` chooses from: the placements of each length-axis assignment, not blended.
+
+    Args:
+      xy: (n, 2) m, sensor frame: the fitted points.
+      rectangles: of the cluster; one at the angle of an earlier one has nothing to add.
+      prior: of the class.
+      evidence: of the sweep.
+      config: the weights.
+      in_row: the rectangles and sides that are in a row of vehicles, see `find_rows`.
+
+    Returns:
+      Three boxes for each side that fits the class, of the first rectangle before those of the second.
+    """
+    assignments: list[list[CompletedBox]] = []
     for i, rectangle in enumerate(rectangles):
         if any(rectangle.angle == before.angle for before in rectangles[:i]):
             continue
@@ -216,12 +243,13 @@ def complete_box(
             free_length, hit = closed_free_length(rays, prior), hit_share(rays, between)
             rays = dataclasses.replace(rays, hit=hit, free_length=free_length)
             agreement = point_agreement(placed, xy, config)
-            placement, objective = choose_placement(rectangle.score, agreement, rays, config)
+            objectives = placement_objectives(rectangle.score, agreement, rays, config)
             if (i, 1 - side) in in_row:
-                objective -= float(config.along_row_cost)
-            box = place(sides, likely_sizes(sides, prior, config), placement, objective)
-            boxes.append(dataclasses.replace(box, in_row=between))
-    return blend_boxes(boxes, max_loss=config.blend_objective) if boxes else None
+                objectives -= float(config.along_row_cost)
+            sizes = likely_sizes(sides, prior, config)
+            boxes = [place(sides, sizes, number, float(worth)) for number, worth in enumerate(objectives)]
+            assignments.append([dataclasses.replace(box, in_row=between) for box in boxes])
+    return assignments
 
 
 def blend_boxes(boxes: Sequence[CompletedBox], *, max_loss: Scalar) -> CompletedBox:
@@ -414,10 +442,10 @@ def point_agreement(boxes: np.ndarray, xy: np.ndarray, config: CompletionConfig)
     return float(config.inside_weight) * inside + float(config.near_weight) * near
 
 
-def choose_placement(
+def placement_objectives(
     score: float, agreement: np.ndarray, rays: RayFractions, config: CompletionConfig
-) -> tuple[int, float]:
-    """The placement of an assignment that explains the evidence best.
+) -> np.ndarray:
+    """How well the placements of an assignment explain the evidence; the first of the best is chosen.
 
     J = hit - wf free - wl free_length + agreement + wc score - cost [width not away].
 
@@ -428,10 +456,8 @@ def choose_placement(
       config: wf, wl, wc and the cost.
 
     Returns:
-      The placement, the first of equally good ones, and its J.
+      (3,) J.
     """
     objective = rays.hit - config.free_weight * rays.free - config.free_length_weight * rays.free_length
     objective = objective + agreement + config.closeness_weight * score
-    objective = objective - config.not_away_cost * np.array([0, 1, 1])
-    placement = int(np.argmax(objective))
-    return placement, float(objective[placement])
+    return objective - config.not_away_cost * np.array([0, 1, 1])

@@ -234,7 +234,7 @@ def _judge_assignments(
         closed = closed_free_length(rays, prior)
         rays = dataclasses.replace(rays, hit=hit_share(rays, in_row), free_length=closed)
         agreement = point_agreement(boxes, *points.table(cluster), config.completion)
-        return choose_placement(score, agreement, rays, config.completion)
+        return first_argmax(placement_objectives(score, agreement, rays, config.completion))
 
     def note(tables: Any, _: jax.Array, rows: tuple[jax.Array, ...]) -> Any:
         entry, *found = rows
@@ -386,13 +386,10 @@ def point_agreement(
     return total / jnp.maximum(count, 1).astype(jnp.float32)[None]
 
 
-def choose_placement(
-    score: jax.Array,
-    agreement: jax.Array,
-    rays: RayFractions,
-    config: CompletionConfig,
-) -> tuple[jax.Array, jax.Array]:
-    """The hypothesis of each assignment that explains the evidence best.
+def placement_objectives(
+    score: jax.Array, agreement: jax.Array, rays: RayFractions, config: CompletionConfig
+) -> jax.Array:
+    """How well the placements of each assignment explain the evidence; the first of the best is chosen.
 
     J = hit - wf free - wl free_length + agreement + wc score - cost [width not away].
 
@@ -403,11 +400,10 @@ def choose_placement(
       config: wf, wl, wc and the cost.
 
     Returns:
-      Its placement (C,) int32, the first of equally good ones, and its J (C,) float32.
+      (3, C) float32: J.
     """
     number = jnp.arange(NUM_PLACEMENTS, dtype=jnp.int32)[:, None]
     cost = config.not_away_cost * (number > 0).astype(jnp.float32)
     objective = rays.hit - config.free_weight * rays.free - config.free_length_weight * rays.free_length
     objective = objective + agreement
-    objective = objective + config.closeness_weight * score[None] - cost
-    return first_argmax(objective)
+    return objective + config.closeness_weight * score[None] - cost
