@@ -216,7 +216,7 @@ class Label(enum.IntEnum):
         max_length_m=7.5,
         max_width_m=2.6,
         min_box_height_m=1.8,
-        far_score_from_m=30.0,
+        far_score_from_m=45.0,
         prior_weight=0.7,
         count_max_height_m=2.7,
         recess_m=0.15,
