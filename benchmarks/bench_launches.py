@@ -1,6 +1,6 @@
 """Counts what a GPU would be asked to do for a sweep, or a batch of them, without a GPU.
 
-    python -m benchmarks.bench_launches [--preset fast] [--batch 64] [--json FILE] [--fail-above 440]
+    python -m benchmarks.bench_launches [--preset fast] [--batch 64] [--json FILE] [--fail-above 460]
 
 XLA compiles `jaxbox.detect` ahead of time for an H100 that is not there. What the host would launch is
 counted by step of the detector: kernels and copies, how many of them in CUDA graphs, how often the host waits
