@@ -27,12 +27,13 @@ def boxes_of(detections):
 
 
 def num_partners(boxes, others):
-    """Boxes that count, and those of them with one of the others in 10 cm, 10 cm of size and 2 degrees."""
+    """Boxes that count, and those with one of the others in 10 cm, 10 cm of size, 2 degrees and .02 of score."""
     boxes = boxes[boxes[:, 7] > MIN_SCORE]
     gap = np.abs(boxes[:, None] - others)
     turn = (boxes[:, None, 6] - others[:, 6] + np.pi / 2) % np.pi - np.pi / 2
     near = np.linalg.norm(gap[..., :3], axis=2) < 0.1
     alike = near & (gap[..., 3:6] < 0.1).all(axis=2) & (np.abs(turn) < np.radians(2))
+    alike &= gap[..., 7] < 0.02
     return np.array([len(boxes), alike.any(axis=1).sum()])
 
 
