@@ -27,7 +27,7 @@ def boxes_of(detections):
 
 
 def num_partners(boxes, others):
-    """Boxes that count, and those with one of the others in 10 cm, 10 cm of size, 2 degrees and .02 of score."""
+    """Boxes that count, and those with another in 10 cm, 10 cm of size, 2 degrees and .02 of score."""
     boxes = boxes[boxes[:, 7] > MIN_SCORE]
     gap = np.abs(boxes[:, None] - others)
     turn = (boxes[:, None, 6] - others[:, 6] + np.pi / 2) % np.pi - np.pi / 2
